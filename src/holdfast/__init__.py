@@ -1,0 +1,50 @@
+"""State estimation that holds when sensors and actuators lie.
+
+float64 throughout: importing holdfast switches JAX to 64-bit numbers, because a noise
+variance of 1e-8 next to an initial variance of 1e4 is normal here. The public names are
+loaded on first use, so that ``holdfast --help`` need not wait for JAX.
+"""
+
+import importlib
+import os
+import sys
+
+__version__ = "0.1.0"
+
+if "jax" in sys.modules:
+    sys.modules["jax"].config.update("jax_enable_x64", True)
+else:
+    os.environ["JAX_ENABLE_X64"] = "1"
+
+_PUBLIC = {
+    "Observation": "records",
+    "Estimate": "records",
+    "Verdict": "records",
+    "Trace": "records",
+    "Status": "records",
+    "LinearPlant": "plants.linear",
+    "NonlinearPlant": "plants.nonlinear",
+    "Kalman": "estimators.kalman",
+    "UnknownInput": "estimators.unknown_input",
+    "Extended": "estimators.extended",
+    "Unscented": "estimators.unscented",
+    "Monitor": "loop",
+    "Scenario": "loop",
+    "monitor_step": "loop",
+    "replay": "loop",
+    "simulate": "loop",
+    "Live": "shell.live",
+    "load_scenario": "shell.files",
+}
+
+__all__ = [*_PUBLIC, "__version__"]
+
+
+def __getattr__(name: str):
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'holdfast' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"holdfast.{_PUBLIC[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

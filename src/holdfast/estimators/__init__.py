@@ -1,0 +1,1 @@
+"""Estimators: state and attack from observations."""

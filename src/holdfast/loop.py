@@ -1,0 +1,168 @@
+"""The only place where time passes: one step, one run, one simulation.
+
+`monitor_step` joins estimate and detect. `replay` scans it over a log, `simulate` over a
+plant under attack, `holdfast.shell.live.Live` calls it sample by sample; all three give the
+same numbers.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from holdfast.parts import Attack, Controller, Detector, Estimator, Plant
+from holdfast.records import (
+    Estimate,
+    Injection,
+    Knowledge,
+    Observation,
+    Status,
+    Trace,
+    Verdict,
+    screen,
+)
+
+
+class Monitor(eqx.Module):
+    """What watches a plant: an estimator and the detector that judges its estimates."""
+
+    estimator: Estimator
+    detector: Detector
+
+    def init(self) -> Any:
+        """The state before the first row."""
+        return self.estimator.init()[0], self.detector.init()
+
+
+class Scenario(eqx.Module):
+    """A plant that starts at ``x0``, whoever steers it, attacks it and watches it."""
+
+    plant: Plant
+    x0: Float[Array, " n"]
+    monitor: Monitor
+    controller: Controller | None = None
+    attacks: tuple[Attack, ...] = ()
+
+
+def monitor_step(
+    monitor: Monitor, state: Any, observation: Observation
+) -> tuple[Any, tuple[Estimate, Verdict]]:
+    """One row: estimate, then judge. The observation has been screened.
+
+    An estimator whose numbers leave the finite range keeps its last finite ones and says
+    DIVERGED, so that a stream goes on and no NaN leaves the core.
+    """
+    before, judged = state
+    after, estimate = monitor.estimator.step(before, observation)
+    leaves = jax.tree.leaves(eqx.filter(after, eqx.is_inexact_array))
+    ok = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))
+    # leaf by leaf, so that a covariance shared over a batch stays shared
+    after = jax.tree.map(_finite_or, after, before)
+    n = estimate.x.shape[0]
+    unknown = jnp.diag(jnp.full(n, jnp.inf))
+    estimate = eqx.tree_at(
+        lambda e: (e.x, e.x_cov, e.d, e.d_free, e.residual, e.residual_cov, e.status),
+        estimate,
+        (
+            _finite_or_zero(estimate.x),
+            jnp.where(jnp.any(jnp.isnan(estimate.x_cov)), unknown, estimate.x_cov),
+            _finite_or_zero(estimate.d),
+            _finite_or_zero(estimate.d_free),
+            _finite_or_zero(estimate.residual),
+            _finite_or_zero(estimate.residual_cov),
+            estimate.status | jnp.where(ok, 0, int(Status.DIVERGED)),
+        ),
+    )
+    judged, verdict = monitor.detector.step(judged, estimate)
+    return (after, judged), (estimate, verdict)
+
+
+def _finite_or(new, old):
+    if not eqx.is_inexact_array(new):
+        return new
+    return jnp.where(jnp.all(jnp.isfinite(new)), new, old)
+
+
+def _finite_or_zero(values):
+    return jnp.where(jnp.isfinite(values), values, 0.0)
+
+
+@eqx.filter_jit
+def replay(monitor: Monitor, observations: Observation) -> Trace:
+    """Estimates and verdicts over a recorded log (time along the leading axis)."""
+
+    def row(carry, observation):
+        state, u_before = carry
+        clean = screen(observation, u_before)
+        state, outcome = monitor_step(monitor, state, clean)
+        return (state, clean.u), (clean, *outcome)
+
+    start = (monitor.init(), jnp.zeros(observations.u.shape[-1]))
+    _, rows = jax.lax.scan(row, start, observations)
+    return Trace(*rows)
+
+
+@eqx.filter_jit
+def simulate(scenario: Scenario, key: PRNGKeyArray, steps: int) -> Trace:
+    """Plant, attack, controller and monitor together for ``steps`` samples.
+
+    At row k: the plant moves under u_k with the attack injected at k-1, the attacker sees the
+    clean sample of k and injects into it, the monitor sees the result. ``Trace.injection`` of
+    row k is what was injected at k, ``Trace.x`` the true state at k.
+    """
+    plant, monitor = scenario.plant, scenario.monitor
+    start_key, attack_key, run_key = jax.random.split(key, 3)
+    zero_u, zero_d = jnp.zeros(len(plant.inputs)), jnp.zeros(len(plant.attacks))
+    known = Knowledge(
+        jnp.asarray(0, jnp.int32), zero_u, plant.output(0, scenario.x0, zero_u, zero_d)
+    )
+    attack_states = tuple(
+        attack.init(k, known)
+        for attack, k in zip(
+            scenario.attacks, jax.random.split(attack_key, len(scenario.attacks) + 1), strict=False
+        )
+    )
+    attack_states, injected = _inject(scenario.attacks, attack_states, known, zero_d)
+    estimator_state, estimate = monitor.estimator.init()
+    state = (estimator_state, monitor.detector.init())
+    del start_key
+
+    def row(carry, inputs):
+        x, state, attack_states, injected, estimate = carry
+        k, key = inputs
+        move_key, measure_key = jax.random.split(key)
+        u = zero_u if scenario.controller is None else scenario.controller.command(estimate)
+        x = plant.advance(move_key, k, x, u + injected.u, injected.d)
+        clean = plant.measure(measure_key, k, x, u, zero_d)
+        attack_states, injected = _inject(
+            scenario.attacks, attack_states, Knowledge(k, u, clean), zero_d
+        )
+        y = plant.measure(measure_key, k, x, u + injected.u, injected.d) + injected.y
+        observation = Observation.of(u, y)
+        state, (estimate, verdict) = monitor_step(monitor, state, observation)
+        return (x, state, attack_states, injected, estimate), (
+            Trace(observation, estimate, verdict, x, injected)
+        )
+
+    carry = (scenario.x0, state, attack_states, injected, estimate)
+    inputs = (jnp.arange(1, steps + 1, dtype=jnp.int32), jax.random.split(run_key, steps))
+    return jax.lax.scan(row, carry, inputs)[1]
+
+
+def _inject(
+    attacks: tuple[Attack, ...], states: tuple, known: Knowledge, zero_d: Array
+) -> tuple[tuple, Injection]:
+    total = Injection(jnp.zeros_like(known.u), jnp.zeros_like(known.y), zero_d)
+    after = []
+    for attack, state in zip(attacks, states, strict=True):
+        state, injection = attack.step(state, known)
+        after.append(state)
+        total = jax.tree.map(jnp.add, total, injection)
+    return tuple(after), total
+
+
+def steps_of(observations: Observation) -> Int[Array, ""] | int:
+    """How many rows a log has."""
+    return observations.y.shape[0]

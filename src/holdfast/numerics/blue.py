@@ -1,0 +1,204 @@
+"""Best linear unbiased updates when part of what is estimated has no prior at all.
+
+A vector is described by  z = estimate + N delta + e,  e ~ (0, P),  delta free: the columns of
+N span what nothing is known about (an attack before any sensor has felt it). A measurement
+y = M z + v, v ~ (0, R), first *splits*: rotated by an orthogonal U, some rows of U W y
+(W R W' = I) determine directions of delta, one each, and the rest are blind to it. Blind rows
+correct e as in a Kalman filter; the others then solve for delta. This is the output
+decomposition of Yong, Zhu and Frazzoli and of NISE (z1, z2 against z3), done for whatever was
+seen, so that missing samples need no case of their own.
+
+Rows are absorbed one at a time with unit noise: scalar divisions by numbers >= 1 instead of
+inverses of innovation covariances, and Joseph's form, so that a prior of 1e8 next to a noise
+of 1e-8 loses nothing.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from holdfast.numerics.linalg import (
+    RANK_TOLERANCE,
+    dot,
+    lower_factor,
+    repeat,
+    solve_lower,
+    symmetric,
+)
+
+
+class Split(NamedTuple):
+    """Which rotated measurement rows determine which free directions.
+
+    ``rotation`` (p x p) orthogonal; ``map`` = rotation @ T (p x q), upper triangular in the
+    order of the pivots; ``pivot`` (p x q) one-hot rows, zero where the row is blind.
+    """
+
+    rotation: Float[Array, "p p"]
+    map: Float[Array, "p q"]
+    pivot: Float[Array, "p q"]
+
+
+class Update(NamedTuple):
+    """z_new = z + gain (W r), with covariance ``cov`` and free directions ``free``.
+
+    ``blind`` maps the whitened innovation W r onto its part that no delta explains.
+    """
+
+    gain: Float[Array, "m p"]
+    cov: Float[Array, "m m"]
+    free: Float[Array, "m q"]
+    blind: Float[Array, "p p"]
+
+
+def whitener(
+    R: Float[Array, "p p"], seen: Bool[Array, " p"]
+) -> tuple[Float[Array, "p p"], Float[Array, "p p"]]:
+    """W with W R W' = I on the rows seen and zero elsewhere, and its inverse there."""
+    both = seen[:, None] & seen[None, :]
+    lower, kept = lower_factor(jnp.where(both, R, jnp.eye(len(seen))))
+    mask = jnp.diag(seen.astype(float))
+    return dot(solve_lower(lower, kept, jnp.eye(len(seen))), mask), dot(mask, lower)
+
+
+def split(T: Float[Array, "p q"], bound: Float[Array, "p q"]) -> Split:
+    """Column-pivoted Householder triangularisation of T, rank decided structurally.
+
+    ``bound`` holds |W| |M| |N|, the size each entry of T = W M N would have without
+    cancellation: a column is zero where it is below `RANK_TOLERANCE` of that.
+    """
+    p, q = T.shape
+    rows, columns = jnp.arange(p), jnp.arange(q)
+    size = jnp.sum(bound * bound, 0)
+    scale = jnp.where(size > 0, 1.0 / jnp.where(size > 0, size, 1.0), 0.0)
+
+    def reflect(i, carry):
+        rotation, mapped, pivot = carry
+        below = jnp.where((rows >= i)[:, None], mapped, 0.0)
+        norms = jnp.sum(below * below, 0) * scale * (1.0 - jnp.sum(pivot, 0))
+        best = jnp.argmax(norms)
+        ok = norms[best] > RANK_TOLERANCE**2
+        chosen = jnp.where(columns == best, 1.0, 0.0)
+        x = jnp.sum(below * chosen, 1)
+        length = jnp.sqrt(jnp.sum(x * x))
+        head = jnp.sum(jnp.where(rows == i, x, 0.0))
+        v = x + jnp.where(rows == i, jnp.where(head >= 0, length, -length), 0.0)
+        norm = jnp.sum(v * v)
+        beta = jnp.where(ok & (norm > 0), 2.0 / jnp.where(norm > 0, norm, 1.0), 0.0)
+        mapped = mapped - (beta * v)[:, None] * dot(v, mapped)
+        rotation = rotation - (beta * v)[:, None] * dot(v, rotation)
+        consumed = ok & (rows > i)[:, None] & (columns == best)
+        row = jnp.where(ok, chosen, 0.0) * (rows == i)[:, None]
+        return rotation, jnp.where(consumed, 0.0, mapped), pivot + row
+
+    start = (jnp.eye(p), T, jnp.zeros((p, q)))
+    return Split(*jax.lax.fori_loop(0, min(p, q), reflect, start))
+
+
+def _correct(
+    joint: Float[Array, "m m+p"], h: Float[Array, " m"], k: Float[Array, " m"], unit: Any
+) -> Float[Array, "m m+p"]:
+    """[P, K] after the unit-noise row h with any gain k, in Joseph's form.
+
+    P <- (I - k h) P (I - k h)' + k k',  K <- (I - k h) K + k e'.
+    """
+    m = h.shape[0]
+    joint = joint - k[:, None] * dot(h, joint)
+    twice = (k - dot(joint[:, :m], h))[:, None] * k
+    return joint + jnp.concatenate([twice, k[:, None] * unit], 1)
+
+
+def absorb_known(
+    P: Float[Array, "m m"], M: Float[Array, "p m"]
+) -> tuple[Float[Array, "m p"], Float[Array, "m m"]]:
+    """Kalman gain and covariance after whitened rows M, where everything has a prior."""
+    p, m = M.shape
+    rows = jnp.arange(p)
+
+    def row(i, joint):
+        along = dot(joint[:, :m], M[i])
+        return _correct(joint, M[i], along / (dot(along, M[i]) + 1.0), rows == i)
+
+    joint = repeat(p, row, jnp.concatenate([P, jnp.zeros((m, p))], 1))
+    return joint[:, m:], symmetric(joint[:, :m])
+
+
+def absorb(
+    P: Float[Array, "m m"], M: Float[Array, "p m"], free: Float[Array, "m q"], parts: Split
+) -> Update:
+    """The best linear unbiased update by whitened rows M, given their split.
+
+    Rotated rows are taken last to first: the blind ones with the Kalman gain, each other with
+    its free column over its pivot, which is the only gain that leaves nothing of that column.
+    """
+    p, m = M.shape
+    rotated = dot(parts.rotation, M)
+    rows = jnp.arange(p)
+
+    def row(step, carry):
+        joint, N, solved = carry
+        i = p - 1 - step
+        h, pivot, unit = rotated[i], parts.pivot[i], jnp.where(rows == i, 1.0, 0.0)
+        used = jnp.sum(pivot) > 0
+        head = jnp.where(used, jnp.sum(pivot * parts.map[i]), 1.0)
+        along = dot(joint[:, :m], h)
+        k = jnp.where(used, dot(N, pivot) / head, along / (dot(along, h) + 1.0))
+        weight = unit - dot(h, joint[:, m:])
+        remaining = (1.0 - solved[:, p] - pivot) * used
+        N = (N - k[:, None] * (parts.map[i] * remaining)) * (1.0 - pivot)
+        solved = solved + pivot[:, None] * jnp.concatenate([weight / head, jnp.ones(1)])
+        return _correct(joint, h, k, unit), N, solved
+
+    start = (
+        jnp.concatenate([P, jnp.zeros((m, p))], 1),
+        free,
+        jnp.zeros((free.shape[1], p + 1)),
+    )
+    joint, N, solved = repeat(p, row, start)
+    blind = parts.rotation - dot(dot(parts.map, solved[:, :p]), parts.rotation)
+    return Update(dot(joint[:, m:], parts.rotation), symmetric(joint[:, :m]), N, blind)
+
+
+def echelon(N: Float[Array, "m q"], bound: Float[Array, "m q"]) -> Float[Array, "m m"]:
+    """A basis of the span of N, at most m columns, reduced so that its zeros are exact.
+
+    Complete pivoting on entries relative to ``bound`` (their size without cancellation).
+    """
+    m, q = N.shape
+    rows, columns = jnp.arange(m), jnp.arange(q)
+
+    def pivot(r, carry):
+        work, size, basis, open_rows, open_columns = carry
+        relative = jnp.where(
+            open_rows[:, None] & open_columns & (size > 0),
+            jnp.abs(work) / jnp.where(size > 0, size, 1.0),
+            0.0,
+        )
+        i, j = jnp.unravel_index(jnp.argmax(relative), (m, q))
+        ok = relative[i, j] > RANK_TOLERANCE
+        head = jnp.where(ok, work[i, j], 1.0)
+        column = jnp.where(rows == i, 1.0, work[:, j] / head)
+        column = jnp.where(jnp.abs(work[:, j]) > RANK_TOLERANCE * size[:, j], column, 0.0)
+        others = jnp.where(columns == j, 0.0, work[i])
+        cleared = jnp.where(rows[:, None] == i, 0.0, work - column[:, None] * others)
+        grown = size + jnp.abs(column)[:, None] * jnp.abs(others)
+        # earlier basis columns lose their entry on the new pivot row: reduced form
+        reduced = basis - column[:, None] * basis[i]
+        basis = jnp.where(rows == r, column[:, None], reduced)
+        return (
+            jnp.where(ok, cleared, work),
+            jnp.where(ok, grown, size),
+            jnp.where(ok, basis, carry[2]),
+            open_rows & ~(ok & (rows == i)),
+            open_columns & ~(ok & (columns == j)),
+        )
+
+    start = (N, bound, jnp.zeros((m, m)), jnp.ones(m, bool), jnp.ones(q, bool))
+    return jax.lax.fori_loop(0, min(m, q), pivot, start)[2]
+
+
+def undetermined(N: Float[Array, "m q"]) -> Bool[Array, " m"]:
+    """Which entries of z the data leave free."""
+    return jnp.any(N != 0, 1)

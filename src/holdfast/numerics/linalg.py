@@ -1,0 +1,135 @@
+"""Small dense linear algebra, fast under `jax.jit` at the sizes of live estimators.
+
+XLA's CPU backend runs a matrix product or a factorisation as a call of its own, which at
+n = 4 costs more than the arithmetic. Up to `SMALL` everything here is written as sums and
+unrolled loops that fuse; above it `jax.numpy.linalg` is faster.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+SMALL = 10
+RANK_TOLERANCE = 1e-10
+"""Relative size under which a pivot is structurally zero: rounding leaves about 1e-15, a
+direction that a sensor sees at all leaves R / (CPC' + R), above 1e-10 unless the prior is
+1e10 times vaguer than the sensor."""
+
+
+def dot(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
+    """a @ b for matrices and vectors, as a fusible sum where the matrices are small."""
+    if max(a.shape + b.shape) > SMALL:
+        return a @ b
+    if a.ndim == 1:
+        return jnp.sum(a * b, 0) if b.ndim == 1 else jnp.sum(a[:, None] * b, 0)
+    if b.ndim == 1:
+        return jnp.sum(a * b[None, :], 1)
+    return jnp.sum(a[:, :, None] * b[None, :, :], 1)
+
+
+def sandwich(a: Float[Array, "m n"], p: Float[Array, "n n"]) -> Float[Array, "m m"]:
+    """A P A', exactly symmetric."""
+    return symmetric(dot(dot(a, p), a.T))
+
+
+def symmetric(p: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """(P + P') / 2."""
+    return 0.5 * (p + p.T)
+
+
+def repeat(count: int, body: Callable[[Any, Any], Any], carry: Any) -> Any:
+    """carry <- body(i, carry) for i = 0 .. count-1, unrolled where that is worth it."""
+    if count > SMALL:
+        return jax.lax.fori_loop(0, count, body, carry)
+    for i in range(count):
+        carry = body(i, carry)
+    return carry
+
+
+def lower_factor(p: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, " n"]]:
+    """L, kept with P = L L' for positive semidefinite P; dependent rows get a zero column.
+
+    Rows are taken in order. Where the pivot is structurally zero (under `RANK_TOLERANCE` of
+    the row's own diagonal) the row is a combination of earlier ones: ``kept`` is False there.
+    """
+    n = p.shape[0]
+    if n > SMALL:
+        return _lower_factor_looped(p)
+    lower = [[jnp.zeros(()) for _ in range(n)] for _ in range(n)]
+    kept = []
+    for j in range(n):
+        pivot = p[j, j] - sum(lower[j][i] * lower[j][i] for i in range(j))
+        ok = pivot > RANK_TOLERANCE * p[j, j]
+        root = jnp.where(ok, jnp.sqrt(jnp.where(ok, pivot, 1.0)), jnp.inf)
+        lower[j][j] = jnp.where(ok, root, 0.0)
+        kept.append(ok)
+        for r in range(j + 1, n):
+            lower[r][j] = (p[r, j] - sum(lower[r][i] * lower[j][i] for i in range(j))) / root
+    return jnp.array(lower).reshape(n, n), jnp.array(kept, bool)
+
+
+def _lower_factor_looped(p):
+    n = p.shape[0]
+    rows = jnp.arange(n)
+
+    def column(j, carry):
+        lower, kept = carry
+        pivot = p[j, j] - jnp.sum(lower[j] * lower[j])
+        ok = pivot > RANK_TOLERANCE * p[j, j]
+        root = jnp.sqrt(jnp.where(ok, pivot, 1.0))
+        entries = jnp.where(ok & (rows >= j), (p[:, j] - lower @ lower[j]) / root, 0.0)
+        return lower.at[:, j].set(entries), kept.at[j].set(ok)
+
+    return jax.lax.fori_loop(0, n, column, (jnp.zeros_like(p), jnp.zeros(n, bool)))
+
+
+def psd_factor(p: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Any F with F F' = P, for positive semidefinite P."""
+    if p.shape[0] > SMALL:
+        values, vectors = jnp.linalg.eigh(p)
+        return vectors * jnp.sqrt(jnp.maximum(values, 0.0))
+    return lower_factor(p)[0]
+
+
+def solve_lower(
+    lower: Float[Array, "n n"], kept: Bool[Array, " n"], b: Float[Array, "n *m"]
+) -> Float[Array, "n *m"]:
+    """X with L X = b by forward substitution; rows that are not kept give 0."""
+    n = lower.shape[0]
+    if n > SMALL:
+        safe = jnp.where(kept[:, None], lower, 0.0) + jnp.diag(jnp.where(kept, 0.0, 1.0))
+        masked = jnp.where(kept.reshape((n,) + (1,) * (b.ndim - 1)), b, 0.0)
+        return jax.scipy.linalg.solve_triangular(safe, masked, lower=True)
+    found: list[Array] = []
+    for i in range(n):
+        rest = b[i] - sum(lower[i, j] * found[j] for j in range(i))
+        found.append(jnp.where(kept[i], rest / jnp.where(kept[i], lower[i, i], 1.0), 0.0))
+    return jnp.stack(found) if found else b
+
+
+def mahalanobis(
+    v: Float[Array, " n"], cov: Float[Array, "n n"]
+) -> tuple[Float[Array, ""], Int[Array, ""]]:
+    """v' cov^+ v and its degrees of freedom.
+
+    Entries of zero or infinite variance carry no information and are left out; so are
+    dependent rows of a singular covariance (for a v in its range the value is the same
+    whichever rows are kept).
+    """
+    variance = jnp.diagonal(cov)
+    used = (variance > 0) & jnp.isfinite(variance)
+    scale = jnp.where(used, 1.0 / jnp.sqrt(jnp.where(used, variance, 1.0)), 0.0)
+    safe = jnp.where(used[:, None] & used[None, :], cov, 0.0)
+    correlation = scale[:, None] * safe * scale[None, :]
+    normalised = scale * v
+    if v.shape[0] > SMALL:
+        values, vectors = jnp.linalg.eigh(correlation)
+        kept = values > RANK_TOLERANCE * jnp.maximum(values[-1], 1.0)
+        squares = (vectors.T @ normalised) ** 2 / jnp.where(kept, values, 1.0)
+        return jnp.sum(jnp.where(kept, squares, 0.0)), jnp.sum(kept)
+    lower, kept = lower_factor(correlation)
+    white = solve_lower(lower, kept, normalised)
+    return jnp.sum(white * white), jnp.sum(kept)

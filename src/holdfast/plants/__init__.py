@@ -1,0 +1,1 @@
+"""Plants: linear (constant, per step or scheduled) and nonlinear."""
