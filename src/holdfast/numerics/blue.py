@@ -42,14 +42,13 @@ class Split(NamedTuple):
 
 
 class Update(NamedTuple):
-    """z_new = z + gain (W r), with covariance ``cov`` and free directions ``free``.
+    """z_new = z + gain (W r) with covariance ``cov``.
 
     ``blind`` maps the whitened innovation W r onto its part that no delta explains.
     """
 
     gain: Float[Array, "m p"]
     cov: Float[Array, "m m"]
-    free: Float[Array, "m q"]
     blind: Float[Array, "p p"]
 
 
@@ -94,7 +93,9 @@ def split(T: Float[Array, "p q"], bound: Float[Array, "p q"]) -> Split:
         return rotation, jnp.where(consumed, 0.0, mapped), pivot + row
 
     start = (jnp.eye(p), T, jnp.zeros((p, q)))
-    return Split(*jax.lax.fori_loop(0, min(p, q), reflect, start))
+    rotation, mapped, pivot = jax.lax.fori_loop(0, min(p, q), reflect, start)
+    noise = RANK_TOLERANCE * jnp.sqrt(size)
+    return Split(rotation, jnp.where(jnp.abs(mapped) > noise, mapped, 0.0), pivot)
 
 
 def _correct(
@@ -119,7 +120,8 @@ def absorb_known(
 
     def row(i, joint):
         along = dot(joint[:, :m], M[i])
-        return _correct(joint, M[i], along / (dot(along, M[i]) + 1.0), rows == i)
+        unit = jnp.where(rows == i, 1.0, 0.0)
+        return _correct(joint, M[i], along / (dot(along, M[i]) + 1.0), unit)
 
     joint = repeat(p, row, jnp.concatenate([P, jnp.zeros((m, p))], 1))
     return joint[:, m:], symmetric(joint[:, :m])
@@ -131,40 +133,59 @@ def absorb(
     """The best linear unbiased update by whitened rows M, given their split.
 
     Rotated rows are taken last to first: the blind ones with the Kalman gain, each other with
-    its free column over its pivot, which is the only gain that leaves nothing of that column.
+    its free column over its pivot, the only gain that leaves nothing of that column.
     """
     p, m = M.shape
     rotated = dot(parts.rotation, M)
     rows = jnp.arange(p)
+    used = jnp.sum(parts.pivot, 1) > 0
+    heads = jnp.where(used, jnp.sum(parts.pivot * parts.map, 1), 1.0)
+    columns = dot(free, parts.pivot.T) / heads
 
     def row(step, carry):
-        joint, N, solved = carry
+        joint, solved = carry
         i = p - 1 - step
-        h, pivot, unit = rotated[i], parts.pivot[i], jnp.where(rows == i, 1.0, 0.0)
-        used = jnp.sum(pivot) > 0
-        head = jnp.where(used, jnp.sum(pivot * parts.map[i]), 1.0)
+        h, unit = rotated[i], jnp.where(rows == i, 1.0, 0.0)
         along = dot(joint[:, :m], h)
-        k = jnp.where(used, dot(N, pivot) / head, along / (dot(along, h) + 1.0))
-        weight = unit - dot(h, joint[:, m:])
-        remaining = (1.0 - solved[:, p] - pivot) * used
-        N = (N - k[:, None] * (parts.map[i] * remaining)) * (1.0 - pivot)
-        solved = solved + pivot[:, None] * jnp.concatenate([weight / head, jnp.ones(1)])
-        return _correct(joint, h, k, unit), N, solved
+        k = jnp.where(used[i], columns[:, i], along / (dot(along, h) + 1.0))
+        weight = (unit - dot(h, joint[:, m:])) / heads[i]
+        return _correct(joint, h, k, unit), solved + parts.pivot[i][:, None] * weight
 
-    start = (
-        jnp.concatenate([P, jnp.zeros((m, p))], 1),
-        free,
-        jnp.zeros((free.shape[1], p + 1)),
-    )
-    joint, N, solved = repeat(p, row, start)
-    blind = parts.rotation - dot(dot(parts.map, solved[:, :p]), parts.rotation)
-    return Update(dot(joint[:, m:], parts.rotation), symmetric(joint[:, :m]), N, blind)
+    start = (jnp.concatenate([P, jnp.zeros((m, p))], 1), jnp.zeros((free.shape[1], p)))
+    joint, solved = repeat(p, row, start)
+    blind = parts.rotation - dot(dot(parts.map, solved), parts.rotation)
+    return Update(dot(joint[:, m:], parts.rotation), symmetric(joint[:, :m]), blind)
 
 
-def echelon(N: Float[Array, "m q"], bound: Float[Array, "m q"]) -> Float[Array, "m m"]:
+def leftover(free: Float[Array, "m q"], parts: Split) -> Float[Array, "m q"]:
+    """What stays free after an update: N minus its determined columns, their place set to 0.
+
+    Determined directions follow the free ones, R1 delta_1 = -T2 delta_2, by back
+    substitution. Entries that only rounding keeps from zero are set to zero.
+    """
+    p, q = parts.map.shape
+    open_columns = 1.0 - jnp.sum(parts.pivot, 0)
+
+    def row(step, follow):
+        i = p - 1 - step
+        pivot = parts.pivot[i]
+        head = jnp.where(jnp.sum(pivot) > 0, jnp.sum(pivot * parts.map[i]), 1.0)
+        through = parts.map[i] * (1.0 - pivot)
+        rest = parts.map[i] * open_columns - through @ follow
+        size = jnp.abs(parts.map[i]) + jnp.abs(through) @ jnp.abs(follow)
+        rest = jnp.where(jnp.abs(rest) > RANK_TOLERANCE * size, rest, 0.0)
+        return follow + pivot[:, None] * rest / head
+
+    follow = jax.lax.fori_loop(0, p, row, jnp.zeros((q, q)))
+    size = jnp.abs(free) + jnp.abs(free) @ jnp.abs(follow)
+    left = (free - free @ follow) * open_columns
+    return jnp.where(jnp.abs(left) > RANK_TOLERANCE * size, left, 0.0)
+
+
+def echelon(N: Float[Array, "m q"]) -> Float[Array, "m m"]:
     """A basis of the span of N, at most m columns, reduced so that its zeros are exact.
 
-    Complete pivoting on entries relative to ``bound`` (their size without cancellation).
+    Complete pivoting on entries relative to their size without cancellation.
     """
     m, q = N.shape
     rows, columns = jnp.arange(m), jnp.arange(q)
@@ -195,7 +216,7 @@ def echelon(N: Float[Array, "m q"], bound: Float[Array, "m q"]) -> Float[Array, 
             open_columns & ~(ok & (columns == j)),
         )
 
-    start = (N, bound, jnp.zeros((m, m)), jnp.ones(m, bool), jnp.ones(q, bool))
+    start = (N, jnp.abs(N), jnp.zeros((m, m)), jnp.ones(m, bool), jnp.ones(q, bool))
     return jax.lax.fori_loop(0, min(m, q), pivot, start)[2]
 
 
