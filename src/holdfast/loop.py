@@ -140,7 +140,8 @@ def simulate(scenario: Scenario, key: PRNGKeyArray, steps: int) -> Trace:
             scenario.attacks, attack_states, Knowledge(k, u, clean), zero_d
         )
         y = plant.measure(measure_key, k, x, u + injected.u, injected.d) + injected.y
-        observation = Observation.of(u, y)
+        everything = jnp.ones(y.shape, bool)
+        observation = Observation(u, y, everything, ~everything, jnp.asarray(0, jnp.int32))
         state, (estimate, verdict) = monitor_step(monitor, state, observation)
         return (x, state, attack_states, injected, estimate), (
             Trace(observation, estimate, verdict, x, injected)

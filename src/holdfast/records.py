@@ -4,11 +4,20 @@ Time convention, kept everywhere: row k holds the input ``u`` applied over k-1..
 measurement ``y`` at k; predict with ``u``, then correct with ``y``.
 """
 
+from collections.abc import Iterable
 from enum import IntEnum, IntFlag
+from typing import Any, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+Array = jax.Array | np.ndarray
+"""Within the core a JAX array; at the boundary (logs, live samples) NumPy serves as well."""
+
+T = TypeVar("T")
 
 
 class Status(IntFlag):
@@ -67,6 +76,14 @@ _REASON_WORDS = {
 }
 
 
+def assemble(kind: type[T], values: Iterable[Any]) -> T:
+    """A record from its fields in order, without the cost of its constructor's checks."""
+    record = object.__new__(kind)
+    fields = dict(zip(kind.__dataclass_fields__, values, strict=True))  # type: ignore[attr-defined]
+    object.__setattr__(record, "__dict__", fields)
+    return record
+
+
 class Observation(eqx.Module):
     """What an estimator is given at step k.
 
@@ -84,11 +101,15 @@ class Observation(eqx.Module):
 
     @classmethod
     def of(cls, u, y, seen=None, trusted=None) -> "Observation":
-        """An observation (or, with a leading time axis, a log) in which all has arrived."""
-        u, y = jnp.asarray(u, float), jnp.asarray(y, float)
-        seen = jnp.ones(y.shape, bool) if seen is None else jnp.asarray(seen, bool)
-        trusted = jnp.zeros(y.shape, bool) if trusted is None else jnp.asarray(trusted, bool)
-        return cls(u, y, seen, trusted, jnp.zeros(y.shape[:-1], jnp.int32))
+        """A sample (or, with a leading time axis, a log) as NumPy arrays, ready for `push`.
+
+        Left out: ``seen`` means that all has arrived, ``trusted`` that nothing is authenticated.
+        """
+        y = np.asarray(y, float)
+        seen = np.ones(y.shape, bool) if seen is None else np.asarray(seen, bool)
+        trusted = np.zeros(y.shape, bool) if trusted is None else np.asarray(trusted, bool)
+        status = np.zeros(y.shape[:-1], np.int32)
+        return assemble(cls, (np.asarray(u, float), y, seen, trusted, status))
 
 
 def screen(observation: Observation, u_before: Float[Array, " nu"]) -> Observation:
@@ -125,7 +146,7 @@ class Estimate(eqx.Module):
     innovation; an unknown-input filter's is blind to the attack by construction.
 
     Conventions of the covariances: a diagonal of ``inf`` marks a quantity that the data do
-    not determine (its value is 0 and its covariances are 0), a diagonal of 0 in
+    not determine (its covariances are 0, and an attack's value too), a diagonal of 0 in
     ``residual_cov`` an output that carried no information at this step.
     """
 

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float, Int
 
 from holdfast.numerics.blue import absorb_known
 from holdfast.numerics.linalg import dot, sandwich
-from holdfast.parts import Estimator, step_zero
+from holdfast.parts import Estimator, Plant, step_zero
 from holdfast.plants.linear import LinearPlant
 from holdfast.records import Estimate, Observation
 
@@ -32,11 +32,7 @@ class Kalman(Estimator):
 
     def init(self) -> tuple[KalmanState, Estimate]:
         """The estimate one sample before the first row."""
-        ny = len(self.plant.outputs)
-        state = KalmanState(step_zero(), self.x0, self.P0)
-        return state, Estimate.without_attack(
-            self.x0, self.P0, jnp.zeros(ny), jnp.zeros((ny, ny)), 0
-        )
+        return first(self.plant, self.x0, self.P0)
 
     def step(
         self, state: KalmanState, observation: Observation
@@ -48,12 +44,33 @@ class Kalman(Estimator):
         P = sandwich(m.A, state.P) + m.Q
         m = self.plant.at(k, x, u)
         W, _ = self.plant.whiten(m.R, observation.seen)
-        innovation = jnp.where(observation.seen, observation.y - dot(m.C, x) - dot(m.D, u), 0.0)
-        gain, P_new = absorb_known(P, dot(W, m.C))
-        x = x + dot(gain, dot(W, innovation))
-        both = observation.seen[:, None] & observation.seen[None, :]
-        innovation_cov = jnp.where(both, sandwich(m.C, P) + m.R, 0.0)
-        estimate = Estimate.without_attack(
-            x, P_new, innovation, innovation_cov, observation.status
-        )
-        return KalmanState(k, x, P_new), estimate
+        expected = dot(m.C, x) + dot(m.D, u)
+        return correct(KalmanState(k, x, P), m.C, m.R, W, expected, observation)
+
+
+def correct(
+    predicted: KalmanState, C, R, W, expected: Float[Array, " ny"], observation: Observation
+) -> tuple[KalmanState, Estimate]:
+    """Correct a prediction with what was seen; W whitens R there, C is h's (local) slope."""
+    k, x, P = predicted.k, predicted.x, predicted.P
+    seen = observation.seen
+    innovation = jnp.where(seen, observation.y - expected, 0.0)
+    gain, P_new = absorb_known(P, dot(W, C))
+    x = x + dot(gain, dot(W, innovation))
+    both = seen[:, None] & seen[None, :]
+    spread = jnp.where(both, sandwich(C, P) + R, 0.0)
+    estimate = Estimate.without_attack(x, P_new, innovation, spread, observation.status)
+    return KalmanState(k, x, P_new), estimate
+
+
+def first(plant: Plant, x0, P0) -> tuple[KalmanState, Estimate]:
+    """State and record one sample before the first row, for filters that assume no attack."""
+    ny = len(plant.outputs)
+    nothing = jnp.zeros(ny), jnp.zeros((ny, ny))
+    estimate = Estimate.without_attack(x0, P0, *nothing, jnp.asarray(0, jnp.int32))
+    return KalmanState(step_zero(), x0, P0), estimate
+
+
+def build(plant: LinearPlant, x0, P0) -> Kalman:
+    """The filter for a linear plant, from the estimate ``x0``, ``P0`` before the first row."""
+    return Kalman(plant, jnp.asarray(x0, float), jnp.asarray(P0, float))

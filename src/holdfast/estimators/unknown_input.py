@@ -26,17 +26,21 @@ from holdfast.records import Estimate, Observation, Status
 
 
 class UnknownInputState(eqx.Module):
-    """(x_k, d_k) with covariance and the basis of what is undetermined about them.
+    """(x_k, d_k) with covariance and the basis ``free`` of what is undetermined about them.
 
-    ``settled``: that basis is the usual one, known beforehand.
+    ``plain``: every sample of this row arrived, none authenticated, and they determined x, so
+    that ``free`` is what H does not see. ``usual``: the structure of a plain row after a plain
+    row, once one was met (``known``); a constant plant need not find it again.
     """
 
     k: Int[Array, ""]
     x: Float[Array, " n"]
     d: Float[Array, " nd"]
-    P: Float[Array, "n+nd n+nd"]
-    free: Float[Array, "n+nd n+nd"]
-    settled: Bool[Array, ""]
+    P: Float[Array, "s s"]
+    free: Float[Array, "s s"]
+    plain: Bool[Array, ""]
+    known: Bool[Array, ""]
+    usual: "Structure | None"
 
 
 class Structure(NamedTuple):
@@ -55,8 +59,7 @@ class UnknownInput(Estimator):
 
     ``direct`` marks the channels whose axis lies in the row space of H: they are given at k,
     the others at k-1 (per step where H is). ``hidden``: some attack that moves the state
-    reaches no output of its own row. ``usual`` is the structure of a step at which every
-    sample arrives and the state is determined; constant plants keep it from the start.
+    reaches no output of its own row.
     """
 
     plant: LinearPlant
@@ -64,15 +67,20 @@ class UnknownInput(Estimator):
     P0: Float[Array, "n n"]
     direct: Bool[Array, "*t nd"]
     hidden: Bool[Array, "*t"]
-    usual: Structure | None
 
     def init(self) -> tuple[UnknownInputState, Estimate]:
         """The estimate one sample before the first row; the attack there is free."""
         n, nd, ny = (len(names) for names in _names(self.plant))
         P = jnp.zeros((n + nd, n + nd)).at[:n, :n].set(self.P0)
         free = jnp.diag(jnp.concatenate([jnp.zeros(n), jnp.ones(nd)]))
+        no = jnp.asarray(False)
+        usual = None
+        if self.plant.constant:
+            size, rows = n + 2 * nd, jnp.zeros((ny, n + 2 * nd))
+            parts = Split(jnp.eye(ny), rows, rows)
+            usual = Structure(parts, jnp.zeros_like(free), jnp.zeros(size, bool))
         state = UnknownInputState(
-            step_zero(), self.x0, jnp.zeros(nd), P, free, jnp.asarray(False)
+            step_zero(), self.x0, jnp.zeros(nd), P, free, no, no, usual
         )
         unknown = jnp.concatenate([jnp.zeros(n, bool), jnp.ones(2 * nd, bool)])
         estimate = self._estimate(
@@ -102,8 +110,8 @@ class UnknownInput(Estimator):
         free = jnp.concatenate([dot(move, state.free), _new_attack(m.H, trusted, n)], 1)
         sense = jnp.concatenate([m.C, H, jnp.zeros((ny, nd))], 1)
         W, W_inverse = self.plant.whiten(m.R, seen)
-        settled = state.settled & jnp.all(seen) & ~jnp.any(trusted)
-        structure, settled = self._structure(settled, W, sense, free, seen, trusted)
+        whole = jnp.all(seen) & ~jnp.any(trusted)
+        structure, known, usual = _structure(state, whole, W, sense, free)
         M = dot(W, sense)
         update = absorb(P, M, free, structure.parts)
         innovation = jnp.where(seen, observation.y - dot(m.C, x) - dot(m.D, u), 0.0)
@@ -122,25 +130,11 @@ class UnknownInput(Estimator):
             | jnp.where(_row(self.hidden, k), int(Status.HIDDEN_INPUT), 0).astype(jnp.int32),
         )
         keep = n + nd
+        plain = whole & ~jnp.any(structure.unknown[:n])
+        P = update.cov[:keep, :keep]
         return UnknownInputState(
-            k, z[:n], z[n:keep], update.cov[:keep, :keep], structure.free, settled
+            k, z[:n], z[n:keep], P, structure.free, plain, known, usual
         ), estimate
-
-    def _structure(
-        self, settled, W, sense, free, seen, trusted
-    ) -> tuple[Structure, Bool[Array, ""]]:
-        n, nd, _ = (len(names) for names in _names(self.plant))
-        keep = n + nd
-        if self.usual is None:
-            return find_structure(W, sense, free, keep), jnp.asarray(False)
-        usual = self.usual
-
-        def anew():
-            structure = find_structure(W, sense, free, keep)
-            again = ~jnp.any(structure.unknown[:n]) & jnp.all(seen) & ~jnp.any(trusted)
-            return structure._replace(free=jnp.where(again, usual.free, structure.free)), again
-
-        return jax.lax.cond(settled, lambda: (usual, jnp.asarray(True)), anew)
 
     def _estimate(self, z, P, unknown, direct, residual, residual_cov, status) -> Estimate:
         n, nd, _ = (len(names) for names in _names(self.plant))
@@ -172,32 +166,36 @@ def find_structure(W, sense, free, keep: int) -> Structure:
     return Structure(parts, echelon(left[:keep]), undetermined(left))
 
 
+def _structure(
+    state: UnknownInputState, whole: Bool[Array, ""], W, sense, free
+) -> tuple[Structure, Bool[Array, ""], Structure | None]:
+    """The structure of this row, and the usual one with whether it is known by now."""
+    keep = state.free.shape[0]
+    usual = state.usual
+    if usual is None:
+        return find_structure(W, sense, free, keep), state.known, None
+    again = state.plain & whole
+
+    def anew():
+        found = find_structure(W, sense, free, keep)
+        kept = jax.tree.map(lambda new, old: jnp.where(again, new, old), found, usual)
+        return found, state.known | again, kept
+
+    return jax.lax.cond(again & state.known, lambda: (usual, state.known, usual), anew)
+
+
 def build(plant: LinearPlant, x0, P0) -> UnknownInput:
     """The estimator for a linear plant, from the estimate ``x0``, ``P0`` before the first row."""
     x0, P0 = jnp.asarray(x0, float), jnp.asarray(P0, float)
     direct, hidden = _over_time(plant, _direct), _over_time(plant, _hidden)
-    usual = jax.jit(_usual)(plant) if plant.constant else None
-    return UnknownInput(plant, x0, P0, jnp.asarray(direct), jnp.asarray(hidden), usual)
-
-
-def _usual(plant: LinearPlant) -> Structure:
-    """The structure of a step at which all is seen, after steps at which all was determined."""
-    n, nd, ny = (len(names) for names in _names(plant))
-    m = plant.at(1, jnp.zeros(n), jnp.zeros(len(plant.inputs)))
-    W, _ = plant.whiten(m.R, jnp.ones(ny, bool))
-    unseen_by_H = leftover(jnp.eye(nd), split(W @ m.H, jnp.abs(W) @ jnp.abs(m.H)))
-    before = jnp.zeros((n + nd, n + nd)).at[n:, n:].set(echelon(unseen_by_H))
-    fresh = _new_attack(m.H, jnp.zeros(ny, bool), n)
-    free = jnp.concatenate([dot(_move(m), before), fresh], 1)
-    sense = jnp.concatenate([m.C, m.H, jnp.zeros((ny, nd))], 1)
-    return find_structure(W, sense, free, n + nd)._replace(free=before)
+    return UnknownInput(plant, x0, P0, jnp.asarray(direct), jnp.asarray(hidden))
 
 
 def _names(plant: LinearPlant) -> tuple[tuple[str, ...], ...]:
     return plant.states, plant.attacks, plant.outputs
 
 
-def _move(m: Matrices) -> Float[Array, "n+2nd n+nd"]:
+def _move(m: Matrices) -> Float[Array, "w s"]:
     """(x, d) -> (A x + G d, 0, d): the attack at k-1 is kept beside the one at k."""
     n, nd = m.G.shape
     return jnp.concatenate(
@@ -209,7 +207,7 @@ def _move(m: Matrices) -> Float[Array, "n+2nd n+nd"]:
     )
 
 
-def _new_attack(H, trusted, n: int) -> Float[Array, "n+2nd nd"]:
+def _new_attack(H, trusted, n: int) -> Float[Array, "w nd"]:
     """The free directions of d_k among (x_k, d_k, d_{k-1}): all, less what is authenticated.
 
     A trusted output cannot have been attacked, so H d = 0 there, exactly.
@@ -253,7 +251,7 @@ def _over_time(plant: LinearPlant, of: Callable[[Matrices], np.ndarray]) -> np.n
         grids = [len(v.values) for v in sources.values() if isinstance(v, Table)]
         each = range(max(grids, default=1))
     found = np.stack([of(Matrices(*(entry(v, i) for v in sources.values()))) for i in each])
-    return found if lengths else np.all(found, 0)
+    return found if lengths else np.asarray(np.all(found, 0))
 
 
 def _rank(rows: np.ndarray) -> int:

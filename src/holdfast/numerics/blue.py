@@ -89,8 +89,8 @@ def split(T: Float[Array, "p q"], bound: Float[Array, "p q"]) -> Split:
         mapped = mapped - (beta * v)[:, None] * dot(v, mapped)
         rotation = rotation - (beta * v)[:, None] * dot(v, rotation)
         consumed = ok & (rows > i)[:, None] & (columns == best)
-        row = jnp.where(ok, chosen, 0.0) * (rows == i)[:, None]
-        return rotation, jnp.where(consumed, 0.0, mapped), pivot + row
+        added = jnp.where(ok & (rows == i)[:, None], chosen, 0.0)
+        return rotation, jnp.where(consumed, 0.0, mapped), pivot + added
 
     start = (jnp.eye(p), T, jnp.zeros((p, q)))
     rotation, mapped, pivot = jax.lax.fori_loop(0, min(p, q), reflect, start)
@@ -99,8 +99,8 @@ def split(T: Float[Array, "p q"], bound: Float[Array, "p q"]) -> Split:
 
 
 def _correct(
-    joint: Float[Array, "m m+p"], h: Float[Array, " m"], k: Float[Array, " m"], unit: Any
-) -> Float[Array, "m m+p"]:
+    joint: Float[Array, "m j"], h: Float[Array, " m"], k: Float[Array, " m"], unit: Any
+) -> Float[Array, "m j"]:
     """[P, K] after the unit-noise row h with any gain k, in Joseph's form.
 
     P <- (I - k h) P (I - k h)' + k k',  K <- (I - k h) K + k e'.

@@ -62,7 +62,7 @@ def linear_plant(
         "attacks": _names("attacks", attacks, "d", _columns(found["G"])),
     }
     for key in ("Q", "R"):
-        found[key] = _mapped(lambda m, key=key: _covariance(key, m), found[key])
+        found[key] = _mapped(lambda m, key=key: covariance(key, m), found[key])
     schedule = _schedule(scheduling, found, names)
     if time == "discrete":
         _warn_if_continuous(found["A"])
@@ -163,7 +163,10 @@ def _names(key: str, names: Sequence[str] | None, letter: str, count: int) -> tu
     return tuple(names)
 
 
-def _covariance(key: str, m: np.ndarray) -> np.ndarray:
+def covariance(key: str, m: Any) -> np.ndarray:
+    """A checked covariance (or stack of them): symmetric, not indefinite, R positive definite."""
+    m = np.asarray(m, float)
+    """``m``, exactly symmetric; `InvalidValue` where it is no covariance (R: not definite)."""
     transposed = np.swapaxes(m, -1, -2)
     size = np.max(np.abs(m), initial=0.0)
     if np.max(np.abs(m - transposed), initial=0.0) > ROUNDING * size:
@@ -205,7 +208,7 @@ def _schedule(
 def _warn_if_continuous(A: np.ndarray | Table) -> None:
     matrices = A.values if isinstance(A, Table) else A
     values = np.linalg.eigvals(np.asarray(matrices))
-    if values.size and (np.all(values.real <= 0) or np.any(values.real < -1.5)):
+    if values.size and np.all(values.real <= 0):
         listed = ", ".join(f"{v:.3g}" for v in np.ravel(values)[:4])
         warnings.warn(
             f"A is taken as discrete, but its eigenvalues ({listed}) look like those of "

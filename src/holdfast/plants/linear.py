@@ -34,7 +34,7 @@ class Table(eqx.Module):
         return (1.0 - share) * self.values[i] + share * self.values[i + 1]
 
 
-Matrix = Float[Array, "r c"] | Float[Array, "t r c"] | Table
+Matrix = Float[Array, "_ _"] | Float[Array, "_ _ _"] | Table
 """Constant, per step (time first; row k of a log uses entry k-1), or scheduled."""
 
 

@@ -1,0 +1,1 @@
+"""Ready plants, one module each: a function ``build`` that returns a checked plant."""

@@ -1,0 +1,135 @@
+"""The same step as `replay` and `simulate`, sample by sample, as fast as Python allows."""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from holdfast.loop import Monitor, monitor_step
+from holdfast.records import Estimate, Observation, Verdict, assemble, screen
+
+
+class _Slot(NamedTuple):
+    """Where one array of a record lies in a flat vector of floats."""
+
+    start: int
+    stop: int
+    shape: tuple[int, ...]
+    dtype: Any
+
+
+class Live:
+    """Holds a monitor's state; `push` takes one observation and returns what it says.
+
+    The step is compiled once with the monitor baked in. State and outcome stay in one flat
+    array that is donated to every call, because handing over many small arrays costs more
+    than the filter. One stream per object; not thread-safe.
+    """
+
+    def __init__(self, monitor: Monitor):
+        # A synchronous call returns as soon as the step is done; a dispatched one takes as
+        # long again to hand over. Without effect if JAX has already computed something.
+        jax.config.update("jax_cpu_enable_async_dispatch", False)
+        plant = monitor.estimator.plant
+        self.monitor = monitor
+        self._nu, self._ny = len(plant.inputs), len(plant.outputs)
+        state = (monitor.init(), jnp.zeros(self._nu))
+        self._sample = np.ones(self._nu + 3 * self._ny + 1)
+        outcome = jax.eval_shape(self._outcome, state, self._sample)[1]
+        outcome_slots, _ = _layout(outcome, 0)
+        self._size = outcome_slots[-1].stop
+        slots, tree = _layout(state, self._size)
+
+        def step(flat, sample):
+            # XLA's CPU backend compiles a small loop as one kernel, and runs straight code
+            # operation by operation, at several times the cost: hence a loop of one turn,
+            # whose length the compiler cannot know.
+            def turn(_, flat):
+                after, outcome = self._outcome(_unpack(flat, slots, tree), sample)
+                return jnp.concatenate([_pack(outcome), _pack(after)])
+
+            return jax.lax.fori_loop(0, sample[-1].astype(int), turn, flat)
+
+        self._step = jax.jit(step, donate_argnums=0)
+        self._start = np.concatenate([np.zeros(self._size), np.asarray(_pack(state))])
+        split = len(jax.tree.leaves(outcome[0]))
+        self._estimate = [_reader(slot) for slot in outcome_slots[:split]]
+        self._verdict = [_reader(slot) for slot in outcome_slots[split:]]
+        self.reset()
+        self.push(Observation.of(np.zeros(self._nu), np.zeros(self._ny)))  # compiles
+        self.reset()
+
+    def reset(self) -> None:
+        """Back to before the first row."""
+        self._flat = jnp.array(self._start)
+
+    def push(self, observation: Observation) -> tuple[Estimate, Verdict]:
+        """One sample: estimate and verdict, as NumPy arrays.
+
+        ``observation`` may hold NumPy arrays (faster) or JAX arrays; NaN, infinity and samples
+        that did not arrive are dealt with as in a log.
+        """
+        nu, ny, sample = self._nu, self._ny, self._sample
+        sample[:nu] = observation.u
+        sample[nu : nu + ny] = observation.y
+        sample[nu + ny : nu + 2 * ny] = observation.seen
+        sample[nu + 2 * ny : -1] = observation.trusted
+        self._flat = self._step(self._flat, sample)
+        values = np.asarray(self._flat)[: self._size].copy()
+        return (
+            assemble(Estimate, [read(values) for read in self._estimate]),
+            assemble(Verdict, [read(values) for read in self._verdict]),
+        )
+
+    def _outcome(self, state, sample):
+        nu, ny = self._nu, self._ny
+        inner, u_before = state
+        observation = Observation(
+            u=sample[:nu],
+            y=sample[nu : nu + ny],
+            seen=sample[nu + ny : nu + 2 * ny] != 0,
+            trusted=sample[nu + 2 * ny : -1] != 0,
+            status=jnp.asarray(0, jnp.int32),
+        )
+        clean = screen(observation, u_before)
+        inner, outcome = monitor_step(self.monitor, inner, clean)
+        return (inner, clean.u), outcome
+
+
+def _layout(tree: Any, start: int) -> tuple[list[_Slot], Any]:
+    leaves, structure = jax.tree.flatten(tree)
+    slots = []
+    for leaf in leaves:
+        stop = start + math.prod(leaf.shape)
+        slots.append(_Slot(start, stop, tuple(leaf.shape), np.dtype(leaf.dtype)))
+        start = stop
+    return slots, structure
+
+
+def _pack(tree: Any) -> jax.Array:
+    """Every leaf as floats in one vector; counters and flags are exact in float64."""
+    return jnp.concatenate([jnp.ravel(leaf).astype(float) for leaf in jax.tree.leaves(tree)])
+
+
+def _unpack(flat: jax.Array, slots: list[_Slot], tree: Any) -> Any:
+    leaves = [flat[s.start : s.stop].reshape(s.shape).astype(s.dtype) for s in slots]
+    return jax.tree.unflatten(tree, leaves)
+
+
+def _reader(slot: _Slot) -> Callable[[np.ndarray], Any]:
+    """What takes one field of a record out of the flat result: a view where it can be."""
+    start, stop, shape, dtype = slot
+    if start == stop:
+        empty = np.zeros(shape, dtype)
+        return lambda values: empty
+    if not shape:
+        convert = dtype.type
+        return lambda values: convert(values[start])
+    if dtype != np.dtype(float):
+        return lambda values: values[start:stop].astype(dtype).reshape(shape)
+    if len(shape) == 1:
+        return lambda values: values[start:stop]
+    return lambda values: values[start:stop].reshape(shape)

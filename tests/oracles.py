@@ -1,0 +1,150 @@
+"""Independent truths, written without any of the package's algebra.
+
+Extended precision here is the 64-bit mantissa of `numpy.longdouble` on x86 (eps 1.1e-19).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+WIDE = np.longdouble
+
+
+class Answer(NamedTuple):
+    """Least-squares values of chosen functionals: value, covariance, which are determined."""
+
+    value: np.ndarray
+    cov: np.ndarray
+    determined: np.ndarray
+    condition: float
+
+
+def cholesky(p: np.ndarray) -> np.ndarray:
+    """Lower Cholesky factor in the precision of ``p``."""
+    n = len(p)
+    lower = np.zeros_like(p)
+    for j in range(n):
+        lower[j, j] = np.sqrt(p[j, j] - lower[j, :j] @ lower[j, :j])
+        for i in range(j + 1, n):
+            lower[i, j] = (p[i, j] - lower[i, :j] @ lower[j, :j]) / lower[j, j]
+    return lower
+
+
+def forward(lower: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """X with L X = b."""
+    x = np.zeros(b.shape, b.dtype)
+    for i in range(len(lower)):
+        x[i] = (b[i] - lower[i, :i] @ x[:i]) / lower[i, i]
+    return x
+
+
+def back(upper: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """X with U X = b."""
+    x = np.zeros(b.shape, b.dtype)
+    for i in range(len(upper) - 1, -1, -1):
+        x[i] = (b[i] - upper[i, i + 1 :] @ x[i + 1 :]) / upper[i, i]
+    return x
+
+
+def pivoted_qr(matrix: np.ndarray, rhs: np.ndarray, tolerance: float):
+    """Householder QR with column pivoting: R, Q'rhs, column order and rank."""
+    work = np.column_stack([matrix, rhs]).astype(WIDE)
+    columns = matrix.shape[1]
+    if min(matrix.shape) == 0:
+        return work, np.arange(columns), 0
+    order = np.arange(columns)
+    first = None
+    for i in range(min(work.shape[0], columns)):
+        norms = np.sum(work[i:, i:columns] ** 2, 0)
+        j = i + int(np.argmax(norms))
+        first = norms[j - i] if first is None else first
+        if first == 0 or norms[j - i] <= (tolerance**2) * first:
+            return work, order, i
+        work[:, [i, j]] = work[:, [j, i]]
+        order[[i, j]] = order[[j, i]]
+        v = work[i:, i].copy()
+        v[0] += np.copysign(np.sqrt(np.sum(v * v)), v[0])
+        beta = 2 / np.sum(v * v)
+        work[i:, i:] -= np.outer(beta * v, v @ work[i:, i:])
+    return work, order, min(work.shape[0], columns)
+
+
+def least_squares(matrix, rhs, tolerance=1e-11) -> Answer:
+    """Minimise |matrix z - rhs|: values and covariances (M'M)^+ of z.
+
+    An entry is determined if no z that ``matrix`` maps to zero moves it.
+    """
+    scale = column_norms(matrix)
+    work, order, rank = pivoted_qr(matrix / scale, rhs, tolerance)
+    upper, columns = work[:rank, :rank], matrix.shape[1]
+    follow = back(upper, work[:rank, rank:columns])
+    inverse = back(upper, np.eye(rank, dtype=WIDE))
+    value = np.zeros(columns, WIDE)
+    half = np.zeros((columns, rank), WIDE)
+    determined = np.zeros(columns, bool)
+    kept = order[:rank]
+    value[kept] = back(upper, work[:rank, columns]) / scale[kept]
+    half[kept] = inverse / scale[kept][:, None]
+    determined[kept] = np.all(np.abs(follow) < 1e-9, 1)
+    singular = np.linalg.svd(upper.astype(float), compute_uv=False)
+    condition = float(singular[0] / singular[-1]) if rank else 1.0
+    return Answer(value, half @ half.T, determined, condition)
+
+
+def column_norms(matrix):
+    norms = np.sqrt(np.sum(matrix.astype(WIDE) ** 2, 0))
+    norms[norms == 0] = 1
+    return norms
+
+
+def eliminate(matrix, rhs, count, tolerance=1e-11):
+    """The rows that are left of a least-squares problem when its first columns are solved for.
+
+    Orthogonal elimination: minimising over z_1 leaves exactly these rows for z_2.
+    """
+    first = matrix[:, :count]
+    work, _, rank = pivoted_qr(
+        first / column_norms(first), np.column_stack([matrix[:, count:], rhs]), tolerance
+    )
+    rest = work[rank:, count:]
+    return rest[:, :-1], rest[:, -1]
+
+
+def batch_estimate(m, x0, P0, u, y, seen, free_attack: bool = True) -> Answer:
+    """Exact (x_k, d_{k-1}, d_k) from rows 1..k, every attack free (or none at all).
+
+    One weighted least-squares problem in all of x_0..x_k and d_0..d_k (``m``: A, B, C, D, G,
+    H, Q, R, constant), solved by orthogonal elimination in the order of time.
+    """
+    A, B, C, D, G, H, Q, R = (np.asarray(v, WIDE) for v in m)
+    n, nd = A.shape[0], G.shape[1] if free_attack else 0
+    G, H = G[:, :nd], H[:, :nd]
+    eye, none = np.eye(n, dtype=WIDE), np.zeros((n, nd), WIDE)
+    root_P, root_Q = cholesky(np.asarray(P0, WIDE)), cholesky(Q)
+    # what is known of (x_k, d_k); of d_0 nothing is
+    info = forward(root_P, np.hstack([eye, none]))
+    rhs = forward(root_P, np.asarray(x0, WIDE))
+    answer = None
+    for inputs, sample, arrived in zip(u, y, np.asarray(seen, bool), strict=True):
+        inputs = np.asarray(inputs, WIDE)
+        # columns: x before | d before, x now, d now
+        rows = [
+            np.hstack([info, np.zeros((len(info), n + nd), WIDE)]),
+            forward(root_Q, np.hstack([-A, -G, eye, none])),
+        ]
+        right = [rhs, forward(root_Q, B @ inputs)]
+        if arrived.any():
+            root_R = cholesky(R[np.ix_(arrived, arrived)])
+            still = np.zeros((arrived.sum(), n + nd), WIDE)
+            rows.append(forward(root_R, np.hstack([still, C[arrived], H[arrived]])))
+            right.append(forward(root_R, (np.asarray(sample, WIDE) - D @ inputs)[arrived]))
+        info, rhs = eliminate(np.vstack(rows), np.concatenate(right), n)
+        answer = least_squares(info, rhs)
+        info, rhs = eliminate(info, rhs, nd)
+    order = np.r_[nd : nd + n, 0:nd, nd + n : n + 2 * nd]
+    return Answer(
+        answer.value[order],
+        answer.cov[np.ix_(order, order)],
+        answer.determined[order],
+        answer.condition,
+    )
