@@ -10,7 +10,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from holdfast.parts import Attack, Controller, Detector, Estimator, Plant
 from holdfast.records import (
@@ -113,7 +113,7 @@ def simulate(scenario: Scenario, key: PRNGKeyArray, steps: int) -> Trace:
     row k is what was injected at k, ``Trace.x`` the true state at k.
     """
     plant, monitor = scenario.plant, scenario.monitor
-    start_key, attack_key, run_key = jax.random.split(key, 3)
+    attack_key, run_key = jax.random.split(key)
     zero_u, zero_d = jnp.zeros(len(plant.inputs)), jnp.zeros(len(plant.attacks))
     known = Knowledge(
         jnp.asarray(0, jnp.int32), zero_u, plant.output(0, scenario.x0, zero_u, zero_d)
@@ -127,7 +127,6 @@ def simulate(scenario: Scenario, key: PRNGKeyArray, steps: int) -> Trace:
     attack_states, injected = _inject(scenario.attacks, attack_states, known, zero_d)
     estimator_state, estimate = monitor.estimator.init()
     state = (estimator_state, monitor.detector.init())
-    del start_key
 
     def row(carry, inputs):
         x, state, attack_states, injected, estimate = carry
@@ -162,8 +161,3 @@ def _inject(
         after.append(state)
         total = jax.tree.map(jnp.add, total, injection)
     return tuple(after), total
-
-
-def steps_of(observations: Observation) -> Int[Array, ""] | int:
-    """How many rows a log has."""
-    return observations.y.shape[0]

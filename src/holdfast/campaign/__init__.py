@@ -1,0 +1,1 @@
+"""Many runs: calibration of thresholds, and what a detector cannot see."""

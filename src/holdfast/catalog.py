@@ -1,0 +1,60 @@
+"""Every part by the name that a scenario gives it. A new part is one line here.
+
+The keys of a scenario's table are the keyword parameters of the function listed.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+from holdfast.attacks import bias, delay, freeze, hopping, noise, ramp, replay, sine
+from holdfast.controllers import feedback
+from holdfast.detectors import chi_square, cusum, per_channel, sprt, windowed
+from holdfast.estimators import extended, kalman, unknown_input, unscented
+from holdfast.plants import build
+from holdfast.plants.library import uav
+
+Builders = dict[str, Callable[..., Any]]
+
+PLANTS: Builders = {
+    "linear": build.linear_plant,
+    "uav": uav.build,
+}
+
+ESTIMATORS: Builders = {
+    "kalman": kalman.build,
+    "unknown_input": unknown_input.build,
+    "extended": extended.build,
+    "unscented": unscented.build,
+}
+
+DETECTORS: Builders = {
+    "chi_square": chi_square.build,
+    "windowed": windowed.build,
+    "cusum": cusum.build,
+    "sprt": sprt.build,
+    "per_channel": per_channel.build,
+}
+
+ATTACKS: Builders = {
+    "bias": bias.build,
+    "ramp": ramp.build,
+    "sine": sine.build,
+    "noise": noise.build,
+    "hopping": hopping.build,
+    "replay": replay.build,
+    "delay": delay.build,
+    "freeze": freeze.build,
+}
+
+CONTROLLERS: Builders = {
+    "lqr": feedback.build,
+}
+
+SECTIONS: dict[str, Builders] = {
+    "plant": PLANTS,
+    "estimator": ESTIMATORS,
+    "detector": DETECTORS,
+    "controller": CONTROLLERS,
+    "attack": ATTACKS,
+}
+"""Every table of a scenario that has a ``kind``, and what it can be."""

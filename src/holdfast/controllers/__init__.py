@@ -1,0 +1,1 @@
+"""Controllers: the input to apply next, from an estimate."""

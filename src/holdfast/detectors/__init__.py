@@ -1,0 +1,1 @@
+"""Detectors: a verdict from the record of every step."""

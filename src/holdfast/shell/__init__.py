@@ -1,0 +1,1 @@
+"""The thin shell: reads, serves and writes; no mathematics."""

@@ -1,0 +1,78 @@
+"""Calibration of a scenario's detector: exact, simulated (kept on disk) or from a log."""
+
+import contextlib
+import dataclasses
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import equinox as eqx
+
+from holdfast import __version__
+from holdfast.campaign.calibrate import Calibration, calibrated, content_key, from_log, with_value
+from holdfast.loop import Scenario
+from holdfast.parts import InvalidValue
+from holdfast.shell.errors import InputError
+from holdfast.shell.logs import read_log
+from holdfast.shell.runtime import cache_folder
+from holdfast.shell.scenario import ScenarioFile
+from holdfast.shell.writing import write_text
+
+
+def calibrated_scenario(found: ScenarioFile) -> tuple[Scenario, Calibration]:
+    """The scenario with its detector calibrated as [detector] asks, and how that was done.
+
+    Raises `InputError`.
+    """
+    monitor, controller = found.scenario.monitor, found.scenario.controller
+    try:
+        if found.calibrate is not None:
+            log = read_log(found.calibrate, found.scenario.plant)
+            monitor, how = from_log(monitor, log.observation)
+        else:
+            kept = _kept(content_key((monitor, controller), (__version__,)))
+            how = _read(kept)
+            if how is None:
+                with busy("calibrating the threshold"):
+                    monitor, how = calibrated(monitor, controller=controller)
+                _keep(kept, how)
+            else:
+                monitor = with_value(monitor, how.value)
+    except InvalidValue as error:
+        key = f"detector.{error.key}"
+        raise InputError(found.path, key, str(error.found), error.expected) from None
+    return eqx.tree_at(lambda s: s.monitor, found.scenario, monitor), how
+
+
+@contextlib.contextmanager
+def busy(words: str) -> Iterator[None]:
+    """Say on standard error what takes long, where somebody watches."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status(words):
+        yield
+
+
+def _kept(name: str) -> Path | None:
+    folder = cache_folder()
+    return None if folder is None else folder / f"calibration-{name}.json"
+
+
+def _read(path: Path | None) -> Calibration | None:
+    if path is None or not path.is_file():
+        return None
+    try:
+        return Calibration(**json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
+        return None  # a damaged entry is made anew
+
+
+def _keep(path: Path | None, how: Calibration) -> None:
+    # what is exact or given costs nothing to find again
+    if path is not None and how.method == "simulated":
+        with contextlib.suppress(InputError):
+            write_text(path, json.dumps(dataclasses.asdict(how)))

@@ -1,0 +1,107 @@
+"""The `holdfast` command. Whatever needs JAX is imported inside a command."""
+
+import sys
+import warnings
+from typing import Annotated
+
+import typer
+
+from holdfast.shell.errors import InputError, one_line
+
+app = typer.Typer(
+    name="holdfast",
+    help="State estimation that holds when sensors and actuators lie.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+ScenarioArgument = Annotated[str, typer.Argument(help="Scenario file (TOML).", show_default=False)]
+AllowPython = Annotated[
+    bool,
+    typer.Option("--allow-python", help='Let kind = "python" run code that the scenario names.'),
+]
+
+
+@app.command()
+def replay(
+    scenario: ScenarioArgument,
+    log: Annotated[
+        str,
+        typer.Argument(
+            help="Recorded log: .csv, .npz, .nc, .ulg, a folder of PX4 topics, or - for stdin.",
+            show_default=False,
+        ),
+    ],
+    output: Annotated[
+        str | None,
+        typer.Option(
+            "-o",
+            help="est.csv, est.nc, or a folder for a report. Default: CSV to standard output.",
+            show_default=False,
+        ),
+    ] = None,
+    allow_python: AllowPython = False,
+) -> None:
+    """Estimate and detect over a recorded log."""
+    from holdfast.shell import commands
+
+    commands.replay(scenario, log, output, allow_python)
+
+
+@app.command()
+def run(
+    scenario: ScenarioArgument,
+    runs: Annotated[
+        int | None,
+        typer.Option("--runs", min=1, help="Number of runs; default the scenario's."),
+    ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option("--seed", min=0, help="Seed of the noise; default the scenario's."),
+    ] = None,
+    output: Annotated[
+        str | None,
+        typer.Option("-o", help="Folder for the report. Default: print the scores."),
+    ] = None,
+    allow_python: AllowPython = False,
+) -> None:
+    """Simulate plant, attack, estimator and detector."""
+    from holdfast.shell import commands
+
+    commands.run(scenario, runs, seed, output, allow_python)
+
+
+@app.command()
+def new(
+    kind: Annotated[
+        str | None,
+        typer.Argument(help="A plant, estimator, detector, controller or attack of the catalog."),
+    ] = None,
+) -> None:
+    """Print a commented scenario to start from."""
+    from holdfast.shell import template
+
+    print(template.scenario_text(kind), end="")
+
+
+@app.command()
+def info() -> None:
+    """Print versions, precision, device and catalog."""
+    from holdfast.shell import commands
+
+    commands.info()
+
+
+def main() -> None:
+    """Run the command; 2 after input that cannot be used, with one line that says why."""
+    warnings.showwarning = _warn
+    try:
+        app()
+    except InputError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
+
+
+def _warn(message, category, filename, lineno, file=None, line=None) -> None:
+    print(f"warning: {one_line(str(message))}", file=sys.stderr)

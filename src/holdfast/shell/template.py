@@ -1,0 +1,192 @@
+"""A commented scenario to start from, made from the catalog so that it always fits."""
+
+import inspect
+import json
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from holdfast.catalog import SECTIONS
+from holdfast.parts import Plant
+from holdfast.shell.errors import InputError, one_of
+from holdfast.shell.scenario import judged
+from holdfast.shell.schema import in_words, model_of
+
+KINDS = {
+    "plant": "linear",
+    "estimator": "unknown_input",
+    "detector": "chi_square",
+    "attack": "bias",
+}
+"""What a template has unless it is asked for something else."""
+
+REQUIRED = {
+    "value": 3.0,
+    "rate": 0.5,
+    "amplitude": 3.0,
+    "frequency": 0.5,
+    "sd": 3.0,
+    "count": 1,
+    "seconds": 2.0,
+}
+"""Values for keys that have no default."""
+
+HEAD = """\
+# A holdfast scenario. Lines that begin with # are comments; a key behind one is optional and
+# shown with its default. Try:
+#     holdfast run THIS_FILE -o report
+#     holdfast replay THIS_FILE LOG.csv -o report
+"""
+
+LINEAR = """\
+[plant]
+# Row k: x_k = A x_{k-1} + B u_k + G d_{k-1} + w,  y_k = C x_k + D u_k + H d_k + v,
+# w ~ N(0, Q), v ~ N(0, R). B, D, G, H may be left out. Any matrix may be
+# { file = "plant.npz", name = "A" } (.mat, .npz, .csv), relative to this file.
+kind = "linear"
+time = "discrete"               # or "continuous", with method = "zoh" | "euler"
+dt = 0.1                        # seconds
+A = [[1.0, 0.1], [0.0, 1.0]]
+B = [[0.005], [0.1]]
+C = [[1.0, 0.0], [0.0, 1.0]]
+G = [[0.005], [0.1]]            # how each attack channel moves the state
+Q = [[1e-6, 0.0], [0.0, 1e-4]]
+R = [[0.25, 0.0], [0.0, 0.0025]]
+states = ["position", "speed"]
+inputs = ["accel"]
+outputs = ["gps", "wheel"]
+attacks = ["accel_attack"]      # one name per column of G and H
+x0 = [0.0, 0.0]                 # the true initial state (run only)
+
+# [plant.constraints]           # what physics allows: matrix z <= bound (+ bound_u u)
+# state  = { matrix = [[1, 0]], bound = [20] }
+# attack = { matrix = [[1], [-1]], bound = [3.5, 3.5] }
+"""
+
+RUN = """\
+[run]
+steps = 300
+runs = 1
+seed = 0
+"""
+
+
+def scenario_text(kind: str | None) -> str:
+    """The template, with the part of the catalog called ``kind`` in its place."""
+    kinds: dict[str, str] = dict(KINDS)
+    if kind is not None:
+        section = next((name for name, parts in SECTIONS.items() if kind in parts), None)
+        if section is None:
+            known = [name for parts in SECTIONS.values() for name in parts]
+            raise InputError("new", "KIND", repr(kind), one_of(known, kind))
+        kinds[section] = kind
+    build = SECTIONS["plant"][kinds["plant"]]
+    plant_text = LINEAR if kinds["plant"] == "linear" else _table("plant", kinds["plant"], build, 0)
+    plant = _built(plant_text, kinds["plant"])
+    start = _start(plant)
+    estimator = SECTIONS["estimator"][kinds["estimator"]](plant, *map(np.asarray, start.values()))
+    notes = {"x0": "estimate one sample before the first row", "P0": "and its covariance"}
+    build = SECTIONS["estimator"][kinds["estimator"]]
+    parts = [HEAD, plant_text, _table("estimator", kinds["estimator"], build, 1, start, notes)]
+    values = {
+        "detector": {"level": 0.01, "on": judged(estimator)},
+        "controller": _weights(plant),
+        "attack": {},
+    }
+    for section, given in values.items():
+        if section in kinds:
+            build = SECTIONS[section][kinds[section]]
+            given = given or _injection(build, plant)
+            parts.append(_table(section, kinds[section], build, 1, given))
+    return "\n".join([*parts, RUN])
+
+
+def _built(text: str, kind: str) -> Plant:
+    import tomllib
+
+    values = tomllib.loads(text)["plant"]
+    return SECTIONS["plant"][kind](
+        **{name: value for name, value in values.items() if name not in ("kind", "x0")}
+    )
+
+
+def _identity(n: int) -> list[list[float]]:
+    return [[float(i == j) for j in range(n)] for i in range(n)]
+
+
+def _start(plant: Plant) -> dict[str, Any]:
+    n = len(plant.states)
+    return {"x0": [0.0] * n, "P0": _identity(n)}
+
+
+def _weights(plant: Plant) -> dict[str, Any]:
+    sizes = {"state_weight": len(plant.states), "input_weight": len(plant.inputs)}
+    return {name: _identity(size) for name, size in sizes.items()}
+
+
+def _injection(build: Callable[..., Any], plant: Plant) -> dict[str, Any]:
+    """What an attack needs: where, when, and the keys without default."""
+    fields = model_of(build, 1).model_fields
+    # what plays back recorded samples cannot hit an attack channel, which carries none
+    target = f"sensor:{plant.outputs[0]}"
+    if "value" in fields and plant.attacks:
+        target = f"channel:{plant.attacks[0]}"
+    needed = {name: REQUIRED[name] for name in fields if name in REQUIRED}
+    return {"channel": target, "start": 10.0, "stop": 20.0, **needed}
+
+
+def _table(
+    section: str,
+    kind: str,
+    build: Callable[..., Any],
+    given: int,
+    values: dict[str, Any] | None = None,
+    notes: dict[str, str] | None = None,
+) -> str:
+    """One table: the values, then every other key of the kind with its default, commented."""
+    values, notes = values or {}, notes or {}
+    lines = ["[[attack]]" if section == "attack" else f"[{section}]"]
+    others = [name for name in SECTIONS[section] if name != kind]
+    lines.append(_line("kind", kind, f"also: {', '.join(others)}" if others else ""))
+    if section == "detector":
+        notes = {"level": "false alarms per step", "on": "attack | residual"}
+    if section == "attack":
+        notes = {
+            "channel": "sensor:NAME, actuator:NAME or channel:NAME (a column of G, H)",
+            "start": "seconds; active for start <= t < stop",
+        }
+    lines += [_line(name, value, notes.get(name, "")) for name, value in values.items()]
+    fields = model_of(build, given).model_fields
+    for name in list(inspect.signature(build).parameters)[given:]:
+        if (
+            name not in values
+            and name != "channels"
+            and name in fields
+            and not fields[name].is_required()
+        ):
+            field = fields[name]
+            words = in_words(field.annotation)
+            if field.default is None:
+                lines.append(f"# {name} = ..".ljust(31) + f" # {words or 'default: none'}")
+            elif section != "plant":
+                lines.append(_line(f"# {name}", field.default, words))
+            else:
+                lines.append(_line(name, field.default, ""))
+    if section == "detector":
+        lines.append(_line("# calibrate", "benign.csv", "a log without attack"))
+    return "\n".join(lines) + "\n"
+
+
+def _line(name: str, value: Any, words: str) -> str:
+    line = f"{name} = {_toml(value)}"
+    return f"{line.ljust(31)} # {words}" if words else line
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, list) and len(value) > 2 and isinstance(value[0], list):
+        return "[\n" + "".join(f"    {json.dumps(row)},\n" for row in value) + "]"
+    if isinstance(value, float) and not math.isfinite(value):
+        return "inf" if value > 0 else "-inf"
+    return json.dumps(value)

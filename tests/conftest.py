@@ -1,0 +1,44 @@
+"""One set-up for all tests: 64 bits, strict promotion, run-time types, one thread."""
+
+import os
+from pathlib import Path
+
+os.environ["OMP_NUM_THREADS"] = "1"
+
+import hypothesis
+import jax
+import jaxtyping
+import pytest
+
+# an int is a float, as in the numeric tower of every static checker
+CHECKER = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"
+
+hypothesis.settings.register_profile("local", deadline=None)
+hypothesis.settings.register_profile("ci", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("ci" if os.environ.get("CI") else "local")
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--no-typecheck",
+        action="store_true",
+        help="leave out the run-time checks of types and shapes (faster)",
+    )
+
+
+def pytest_configure(config):
+    jax.config.update("jax_enable_x64", True)
+    # rank promotion stays allowed: k[:, None] * row is how this code writes an outer product
+    jax.config.update("jax_numpy_dtype_promotion", "strict")
+    if not config.getoption("--no-typecheck"):
+        jaxtyping.install_import_hook("holdfast", CHECKER)
+
+
+@pytest.fixture(scope="session")
+def shared_data():
+    """The folder of recorded data sets; HOLDFAST_DATA says where it is."""
+    default = Path(__file__).parents[1] / ".." / "shared" / "data"
+    folder = Path(os.environ.get("HOLDFAST_DATA", default)).resolve()
+    if not folder.is_dir():
+        pytest.skip(f"no recorded data at {folder}: set HOLDFAST_DATA to their folder")
+    return folder
