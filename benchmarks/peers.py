@@ -93,7 +93,7 @@ def scan(estimator, y, keep):
 def timed(contest: Contest, repeat: int, units: int) -> dict[str, float]:
     """Median seconds per unit of each contestant, rounds alternating."""
     taken: dict[str, list[float]] = {name: [] for name in contest}
-    for name, run in contest.items():
+    for run in contest.values():
         run()
     for _ in range(repeat):
         for name, run in contest.items():

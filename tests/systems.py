@@ -3,11 +3,14 @@
 import warnings
 from typing import NamedTuple
 
+import equinox as eqx
+import jax
 import numpy as np
 from scipy.linalg import eigvals
 
 from holdfast.plants.build import linear_plant
 from holdfast.plants.linear import LinearPlant
+from holdfast.records import Observation
 
 
 class System(NamedTuple):
@@ -100,3 +103,15 @@ def matrices(plant: LinearPlant) -> list[np.ndarray]:
     """A, B, C, D, G, H, Q, R of a constant plant."""
     found = plant.at(1, np.zeros(len(plant.states)), np.zeros(len(plant.inputs)))
     return [np.asarray(m) for m in found]
+
+
+@eqx.filter_jit
+def run(estimator, observations):
+    """Every estimate of a log; plant arrays are arguments, so one compilation a shape."""
+    start = estimator.init()[0]
+    return jax.lax.scan(lambda s, o: estimator.step(s, o), start, observations)[1]
+
+
+def estimates(estimator, u, y, seen):
+    observation = Observation.of(u, np.where(seen, y, 0.0), seen)
+    return jax.tree.map(np.asarray, run(estimator, observation))

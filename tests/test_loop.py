@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import systems
 
+import systems
 from holdfast.attacks import bias
 from holdfast.detectors import chi_square
 from holdfast.estimators import kalman, unknown_input

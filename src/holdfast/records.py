@@ -6,7 +6,7 @@ measurement ``y`` at k; predict with ``u``, then correct with ``y``.
 
 from collections.abc import Iterable
 from enum import IntEnum, IntFlag
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -14,8 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-Array = jax.Array | np.ndarray
-"""Within the core a JAX array; at the boundary (logs, live samples) NumPy serves as well."""
+if TYPE_CHECKING:
+    Array = jax.Array
+else:
+    # within the core a JAX array; at the boundary (logs, live samples) NumPy serves as well
+    Array = jax.Array | np.ndarray
 
 T = TypeVar("T")
 

@@ -1,7 +1,6 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from monitors import monitor
 from scipy.optimize import brentq
 from scipy.stats import chi2, ncx2
 
@@ -11,6 +10,7 @@ from holdfast.estimators import kalman
 from holdfast.loop import Monitor
 from holdfast.parts import InvalidValue
 from holdfast.plants.build import linear_plant
+from monitors import monitor
 
 
 def memoryless(level):

@@ -2,13 +2,16 @@
 
 import inspect
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from holdfast.catalog import ATTACKS, CONTROLLERS, DETECTORS, ESTIMATORS
+from holdfast.loop import Monitor, replay
 from holdfast.plants.build import linear_plant
-from holdfast.records import Estimate
+from holdfast.records import Estimate, Observation
+from holdfast.shell.live import Live
 from holdfast.testing import check_attack, check_detector, check_estimator
 
 
@@ -75,11 +78,17 @@ def test_every_entry_is_covered(catalog, covered):
     assert covered.keys() == catalog.keys()
 
 
-@pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS)
-@pytest.mark.parametrize("kind", ESTIMATOR_SETTINGS)
+@pytest.mark.parametrize(
+    ("kind", "plant"),
+    # what the attacks of the plant are concerns only those that estimate them
+    [(kind, "both") for kind in ESTIMATOR_SETTINGS]
+    + [("unknown_input", name) for name in PLANTS if name != "both"],
+)
 def test_estimators(kind, plant):
     settings = ESTIMATOR_SETTINGS[kind]
-    check_estimator(lambda plant: ESTIMATORS[kind](plant, X0, P0, **settings), plant, steps=24)
+    check_estimator(
+        lambda plant: ESTIMATORS[kind](plant, X0, P0, **settings), PLANTS[plant], steps=20
+    )
 
 
 @pytest.mark.parametrize("on", ["attack", "residual"])
@@ -107,6 +116,24 @@ def test_controllers(kind):
     command = controller.command(estimate)
     assert command.shape == (1,)
     assert np.all(np.isfinite(command))
+
+
+@pytest.mark.parametrize("kind", ESTIMATOR_SETTINGS)
+def test_live_gives_the_numbers_of_a_replay(kind):
+    plant = PLANTS["both"]
+    estimator = ESTIMATORS[kind](plant, X0, P0, **ESTIMATOR_SETTINGS[kind])
+    monitor = Monitor(estimator, DETECTORS["windowed"](plant, length=4))
+    rng = np.random.default_rng(1)
+    u, y = rng.normal(size=(20, 1)), rng.normal(size=(20, 3))
+    u[4], y[6, 1], y[9] = np.nan, np.inf, np.nan
+    seen = rng.random((20, 3)) > 0.2
+    trace = replay(monitor, Observation.of(u, y, seen))
+    live = Live(monitor)
+    for k in range(20):
+        said = live.push(Observation.of(u[k], y[k], seen[k]))
+        expected = jax.tree.map(lambda leaf, k=k: leaf[k], (trace.estimate, trace.verdict))
+        for found, leaf in zip(jax.tree.leaves(said), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(found, leaf, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("catalog", [ESTIMATORS, DETECTORS, ATTACKS, CONTROLLERS])

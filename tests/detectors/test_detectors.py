@@ -3,12 +3,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.stats import chi2, ncx2, norm
-from streams import judge, plant_of, records
 
 from holdfast.detectors import chi_square, cusum, per_channel, sprt, windowed
 from holdfast.numerics.chi_square import weighted_quantile
 from holdfast.parts import InvalidValue
 from holdfast.records import Reason
+from streams import judge, plant_of, records
 
 ALL = [
     (chi_square, {}),

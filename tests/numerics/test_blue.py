@@ -3,8 +3,8 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import oracles
 
+import oracles
 from holdfast.numerics.blue import absorb_known, echelon, leftover, split, whitener
 
 absorb_jit = jax.jit(absorb_known)

@@ -60,9 +60,7 @@ def test_per_step_matrices_start_with_row_1():
 
 def test_scheduled_matrices_interpolate_and_hold_beyond_the_grid():
     table = Table(jnp.asarray([0.0, 2.0, 10.0]), jnp.asarray(np.stack([I2, 3 * I2, 5 * I2])))
-    plant = linear_plant(
-        A=table, B=B, C=C, Q=Q, R=R, states=["speed", "other"], scheduling="speed"
-    )
+    plant = linear_plant(A=table, B=B, C=C, Q=Q, R=R, states=["speed", "other"], scheduling="speed")
     for speed, factor in [(-5.0, 1.0), (0.0, 1.0), (1.0, 2.0), (2.0, 3.0), (6.0, 4.0), (99, 5.0)]:
         np.testing.assert_allclose(at(plant, x=(float(speed), 7.0)).A, factor * I2, atol=1e-14)
 
@@ -79,7 +77,7 @@ def test_scheduled_continuous_plant_is_sampled_at_every_value():
 
 
 def test_a_discrete_plant_that_looks_continuous_is_told():
-    with pytest.warns(UserWarning, match="time = \"continuous\""):
+    with pytest.warns(UserWarning, match='time = "continuous"'):
         linear_plant(A=A, C=C, Q=Q, R=R)
 
 

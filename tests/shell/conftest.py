@@ -2,8 +2,12 @@
 
 import io
 import sys
+from pathlib import Path
 
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
 from shell_samples import LOG, SCENARIO
 
 from holdfast.shell import cli

@@ -2,11 +2,17 @@
 
 import io
 import os
+import warnings
 import zipfile
 
+import hypothesis
+import hypothesis.strategies as st
 import numpy as np
 import pytest
 from shell_samples import LOG, SCENARIO
+
+from holdfast.shell.errors import InputError
+from holdfast.shell.files import read_log, read_scenario
 
 EYE = "[[1.0, 0.0], [0.0, 1.0]]"
 
@@ -296,3 +302,49 @@ def test_folder_without_permission(folder, command):
 def test_device_is_not_replaced(folder, command):
     outcome = command("replay", folder / "scenario.toml", folder / "log.csv", "-o", "/dev/full")
     assert_refused(outcome, folder, ["/dev/full", "a device"], names(folder))
+
+
+def refusal(read):
+    """What an `InputError` says; None where all is well. Any other error gets through."""
+    try:
+        read()
+    except InputError as error:
+        return str(error)
+    return None
+
+
+@hypothesis.settings(max_examples=60)
+@hypothesis.given(
+    row=st.integers(0, 12),
+    cell=st.integers(0, 3),
+    text=st.one_of(
+        st.text(max_size=8), st.sampled_from(["", "nan", "-inf", "1e400", '"', ",", "\n", "0.3"])
+    ),
+)
+def test_any_cell_may_be_spoilt(tmp_path_factory, row, cell, text):
+    folder = tmp_path_factory.mktemp("fuzz")
+    (folder / "scenario.toml").write_text(SCENARIO)
+    lines = [line.split(",") for line in LOG.splitlines()]
+    lines[row][cell] = text
+    content = "\n".join(map(",".join, lines)).encode("utf-8", "surrogatepass")
+    (folder / "log.csv").write_bytes(content)
+    plant = read_scenario(folder / "scenario.toml").scenario.plant
+    message = refusal(lambda: read_log(folder / "log.csv", plant))
+    assert message is None or ("log.csv" in message and "\n" not in message)
+
+
+@hypothesis.settings(max_examples=60)
+@hypothesis.given(
+    line=st.integers(0, 28),
+    at=st.integers(0, 60),
+    text=st.text("[]{}=.,\"'#\n0123456789aeinft", max_size=4),
+)
+def test_any_character_of_a_scenario_may_be_spoilt(tmp_path_factory, line, at, text):
+    folder = tmp_path_factory.mktemp("fuzz")
+    lines = SCENARIO.splitlines()
+    lines[line] = lines[line][:at] + text + lines[line][at + 1 :]
+    (folder / "scenario.toml").write_text("\n".join(lines))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # a plant that now looks continuous
+        message = refusal(lambda: read_scenario(folder / "scenario.toml"))
+    assert message is None or ("scenario.toml" in message and "\n" not in message)

@@ -23,7 +23,7 @@ class Feedback(Controller):
 
     def command(self, estimate: Estimate) -> Float[Array, " nu"]:
         """The input to apply over the next sample."""
-        return -dot(self.gain, estimate.x - self.reference)
+        return -dot(self.gain, jnp.asarray(estimate.x) - self.reference)
 
 
 def build(

@@ -26,9 +26,7 @@ class Extended(Estimator):
         """The estimate one sample before the first row."""
         return first(self.plant, self.x0, self.P0)
 
-    def step(
-        self, state: KalmanState, observation: Observation
-    ) -> tuple[KalmanState, Estimate]:
+    def step(self, state: KalmanState, observation: Observation) -> tuple[KalmanState, Estimate]:
         """One row of the recursion."""
         k, u, seen = state.k + 1, observation.u, observation.seen
         none = no_attack(self.plant)

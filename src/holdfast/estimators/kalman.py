@@ -34,9 +34,7 @@ class Kalman(Estimator):
         """The estimate one sample before the first row."""
         return first(self.plant, self.x0, self.P0)
 
-    def step(
-        self, state: KalmanState, observation: Observation
-    ) -> tuple[KalmanState, Estimate]:
+    def step(self, state: KalmanState, observation: Observation) -> tuple[KalmanState, Estimate]:
         """One row of the recursion."""
         k, u = state.k + 1, observation.u
         m = self.plant.at(k, state.x, u)

@@ -10,7 +10,7 @@ Source: CARE (5)-(8), (15), Algorithm 1; NISE (8), Algorithm 1, with the errata 
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -79,9 +79,7 @@ class UnknownInput(Estimator):
             size, rows = n + 2 * nd, jnp.zeros((ny, n + 2 * nd))
             parts = Split(jnp.eye(ny), rows, rows)
             usual = Structure(parts, jnp.zeros_like(free), jnp.zeros(size, bool))
-        state = UnknownInputState(
-            step_zero(), self.x0, jnp.zeros(nd), P, free, no, no, usual
-        )
+        state = UnknownInputState(step_zero(), self.x0, jnp.zeros(nd), P, free, no, no, usual)
         unknown = jnp.concatenate([jnp.zeros(n, bool), jnp.ones(2 * nd, bool)])
         estimate = self._estimate(
             jnp.concatenate([self.x0, jnp.zeros(2 * nd)]),
@@ -240,7 +238,7 @@ def _over_time(plant: LinearPlant, of: Callable[[Matrices], np.ndarray]) -> np.n
     sources = {name: getattr(plant, name) for name in Matrices._fields}
     lengths = [len(v) for v in sources.values() if not isinstance(v, Table) and v.ndim == 3]
 
-    def entry(source, i):
+    def entry(source, i) -> Any:
         if isinstance(source, Table):
             return np.asarray(source.values)[i % len(source.values)]
         return np.asarray(source if source.ndim == 2 else source[i])

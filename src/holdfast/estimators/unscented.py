@@ -33,9 +33,7 @@ class Unscented(Estimator):
         """The estimate one sample before the first row."""
         return first(self.plant, self.x0, self.P0)
 
-    def step(
-        self, state: KalmanState, observation: Observation
-    ) -> tuple[KalmanState, Estimate]:
+    def step(self, state: KalmanState, observation: Observation) -> tuple[KalmanState, Estimate]:
         """One row of the recursion."""
         k, u, seen = state.k + 1, observation.u, observation.seen
         none = no_attack(self.plant)
@@ -55,9 +53,7 @@ class Unscented(Estimator):
         P_new = sandwich(factor, cov)
         both = seen[:, None] & seen[None, :]
         innovation_cov = jnp.where(both, symmetric(dot(slope, slope.T)) + spread, 0.0)
-        estimate = Estimate.without_attack(
-            x, P_new, innovation, innovation_cov, observation.status
-        )
+        estimate = Estimate.without_attack(x, P_new, innovation, innovation_cov, observation.status)
         return KalmanState(k, x, P_new), estimate
 
 

@@ -20,7 +20,7 @@ direction that a sensor sees at all leaves R / (CPC' + R), above 1e-10 unless th
 
 
 def dot(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
-    """a @ b for matrices and vectors, as a fusible sum where the matrices are small."""
+    """A @ b for matrices and vectors, as a fusible sum where the matrices are small."""
     if max(a.shape + b.shape) > SMALL:
         return a @ b
     if a.ndim == 1:
@@ -41,7 +41,7 @@ def symmetric(p: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def repeat(count: int, body: Callable[[Any, Any], Any], carry: Any) -> Any:
-    """carry <- body(i, carry) for i = 0 .. count-1, unrolled where that is worth it."""
+    """Carry <- body(i, carry) for i = 0 .. count-1, unrolled where that is worth it."""
     if count > SMALL:
         return jax.lax.fori_loop(0, count, body, carry)
     for i in range(count):
@@ -113,7 +113,7 @@ def solve_lower(
 def mahalanobis(
     v: Float[Array, " n"], cov: Float[Array, "n n"]
 ) -> tuple[Float[Array, ""], Int[Array, ""]]:
-    """v' cov^+ v and its degrees of freedom.
+    """V' cov^+ v and its degrees of freedom.
 
     Entries of zero or infinite variance carry no information and are left out; so are
     dependent rows of a singular covariance (for a v in its range the value is the same

@@ -11,7 +11,7 @@ import numpy as np
 from holdfast.numerics.blue import whitener
 from holdfast.numerics.sampling import sample
 from holdfast.parts import InvalidValue
-from holdfast.plants.linear import Constraints, LinearPlant, Matrix, Sampling, Table
+from holdfast.plants.linear import Constraints, LinearPlant, Sampling, Table
 
 ROUNDING = 1e-8
 """Relative asymmetry and indefiniteness of a covariance put down to rounding: files hold
@@ -70,7 +70,7 @@ def linear_plant(
     else:
         found, sampling = _discretised(found, dt, method, noise)
     limits = _constraints(constraints or {}, *(len(names[k]) for k in names if k != "outputs"))
-    arrays = {key: _mapped(jnp.asarray, value) for key, value in found.items()}
+    arrays: dict[str, Any] = {key: _mapped(jnp.asarray, value) for key, value in found.items()}
     constant_R = not isinstance(found["R"], Table) and found["R"].ndim == 2
     everything = jnp.ones(len(names["outputs"]), bool)
     return LinearPlant(
@@ -78,7 +78,10 @@ def linear_plant(
         white=jax.jit(whitener)(arrays["R"], everything) if constant_R else None,
         constraints=limits,
         dt=float(dt),
-        **names,
+        states=names["states"],
+        inputs=names["inputs"],
+        outputs=names["outputs"],
+        attacks=names["attacks"],
         schedule=schedule,
         sampling=sampling,
     )
@@ -91,11 +94,13 @@ def _choice(key: str, value: str, allowed: tuple[str, ...]) -> None:
 
 def _matrix(key: str, value: Any) -> np.ndarray | Table:
     if isinstance(value, Table):
-        grid, values = np.asarray(value.grid, float), _matrix(key, np.asarray(value.values))
+        grid, values = np.asarray(value.grid, float), np.asarray(value.values, float)
         if grid.ndim != 1 or len(grid) < 2 or np.any(np.diff(grid) <= 0):
             raise InvalidValue(f"{key}.grid", grid.tolist(), "two or more increasing numbers")
-        if np.ndim(values) != 3 or len(values) != len(grid):  # type: ignore[arg-type]
-            raise InvalidValue(f"{key}.values", np.shape(values), f"{len(grid)} matrices")
+        if values.ndim != 3 or len(values) != len(grid):
+            raise InvalidValue(f"{key}.values", values.shape, f"{len(grid)} matrices")
+        if not np.all(np.isfinite(values)):
+            raise InvalidValue(f"{key}.values", "NaN or infinity", "finite numbers")
         return Table(jnp.asarray(grid), jnp.asarray(values))
     try:
         array = np.asarray(value, float)

@@ -73,12 +73,21 @@ def nonlinear_plant(
     for name, matrix, size in (("Q", Q, len(states)), ("R", R, len(outputs))):
         if matrix.shape != (size, size):
             raise InvalidValue(name, f"shape {matrix.shape}", f"{size} x {size}")
-    names = (tuple(states), tuple(inputs), tuple(outputs), tuple(attacks))
-    return NonlinearPlant(jnp.asarray(Q), jnp.asarray(R), f, h, float(dt), *names)
+    return NonlinearPlant(
+        Q=jnp.asarray(Q),
+        R=jnp.asarray(R),
+        f=f,
+        h=h,
+        dt=float(dt),
+        states=tuple(states),
+        inputs=tuple(inputs),
+        outputs=tuple(outputs),
+        attacks=tuple(attacks),
+    )
 
 
 def sampled(rate: Function, dt: float, substeps: int = 1) -> Function:
-    """f for `nonlinear_plant` from x' = rate(x, u, d): fourth-order Runge-Kutta, u, d held."""
+    """F for `nonlinear_plant` from x' = rate(x, u, d): fourth-order Runge-Kutta, u, d held."""
     step = dt / substeps
 
     def f(x, u, d):

@@ -90,7 +90,7 @@ def _reasons(codes: np.ndarray, flags: np.ndarray, names: Sequence[str]) -> np.n
     on_channel = np.isin(codes, (Reason.ATTACK_CHANNEL, Reason.RESIDUAL_CHANNEL))
     for row in np.flatnonzero(on_channel):
         pointed = "+".join(name for name, flag in zip(names, flags[row], strict=True) if flag)
-        words[row] = f"{words[row]} {pointed}"
+        words[row] = _quoted(f"{words[row]} {pointed}")
     return words
 
 
@@ -100,8 +100,8 @@ def _words(codes: np.ndarray, of) -> np.ndarray:
 
 
 def _texts(values: np.ndarray, empty: np.ndarray) -> list[str]:
-    text = _quoted if values.dtype == object else repr
-    cells = [text(value) for value in values.tolist()]
+    # words come quoted; repr of a float is the shortest text that reads back as the same
+    cells = values.tolist() if values.dtype == object else list(map(repr, values.tolist()))
     for row in np.flatnonzero(empty):
         cells[row] = ""
     return cells

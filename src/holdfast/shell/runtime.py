@@ -1,5 +1,6 @@
 """JAX as the command wants it: compiled code kept on disk, no asynchronous dispatch."""
 
+import gc
 import os
 import stat
 from pathlib import Path
@@ -16,6 +17,8 @@ def configure() -> Path | None:
     import jax
 
     jax.config.update("jax_cpu_enable_async_dispatch", False)
+    # what has been imported stays to the end: looking through it again slows the reading of logs
+    gc.freeze()
     folder = cache_folder()
     if folder is None:
         return None

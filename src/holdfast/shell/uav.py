@@ -13,7 +13,7 @@ from holdfast.parts import Plant
 from holdfast.plants.library.uav import GPS
 from holdfast.records import Observation
 from holdfast.shell.errors import InputError, one_of, shown
-from holdfast.shell.logs import Log
+from holdfast.shell.grid import Log
 from holdfast.shell.topics import Topic, read_topics
 
 GPS_TOPIC, BARO_TOPIC = "vehicle_gps_position", "vehicle_air_data"
