@@ -112,6 +112,6 @@ def run(estimator, observations):
     return jax.lax.scan(lambda s, o: estimator.step(s, o), start, observations)[1]
 
 
-def estimates(estimator, u, y, seen):
-    observation = Observation.of(u, np.where(seen, y, 0.0), seen)
+def estimates(estimator, u, y, seen, trusted=None):
+    observation = Observation.of(u, np.where(seen, y, 0.0), seen, trusted)
     return jax.tree.map(np.asarray, run(estimator, observation))

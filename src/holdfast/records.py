@@ -4,9 +4,9 @@ Time convention, kept everywhere: row k holds the input ``u`` applied over k-1..
 measurement ``y`` at k; predict with ``u``, then correct with ``y``.
 """
 
-from collections.abc import Iterable
+import functools
 from enum import IntEnum, IntFlag
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 else:
     # within the core a JAX array; at the boundary (logs, live samples) NumPy serves as well
     Array = jax.Array | np.ndarray
-
-T = TypeVar("T")
 
 
 class Status(IntFlag):
@@ -79,12 +77,12 @@ _REASON_WORDS = {
 }
 
 
-def assemble(kind: type[T], values: Iterable[Any]) -> T:
-    """A record from its fields in order, without the cost of its constructor's checks."""
-    record = object.__new__(kind)
-    fields = dict(zip(kind.__dataclass_fields__, values, strict=True))  # type: ignore[attr-defined]
-    object.__setattr__(record, "__dict__", fields)
-    return record
+@functools.lru_cache(maxsize=16)
+def _same(shape: tuple[int, ...], value: bool) -> np.ndarray:
+    """A constant array, shared by all samples and so read-only."""
+    array = np.full(shape, value)
+    array.flags.writeable = False
+    return array
 
 
 class Observation(eqx.Module):
@@ -109,10 +107,13 @@ class Observation(eqx.Module):
         Left out: ``seen`` means that all has arrived, ``trusted`` that nothing is authenticated.
         """
         y = np.asarray(y, float)
-        seen = np.ones(y.shape, bool) if seen is None else np.asarray(seen, bool)
-        trusted = np.zeros(y.shape, bool) if trusted is None else np.asarray(trusted, bool)
+        seen = _same(y.shape, True) if seen is None else np.asarray(seen, bool)
+        trusted = _same(y.shape, False) if trusted is None else np.asarray(trusted, bool)
         status = np.zeros(y.shape[:-1], np.int32)
-        return assemble(cls, (np.asarray(u, float), y, seen, trusted, status))
+        fields = {"u": np.asarray(u, float), "y": y, "seen": seen, "trusted": trusted}
+        record = object.__new__(cls)  # the constructor's checks cost more than a filter's step
+        object.__setattr__(record, "__dict__", fields | {"status": status})
+        return record
 
 
 def screen(observation: Observation, u_before: Float[Array, " nu"]) -> Observation:

@@ -13,6 +13,7 @@ from holdfast.parts import Attack, Detector, Estimator, Plant
 from holdfast.plants.build import linear_plant
 from holdfast.records import Status
 from holdfast.testing import check_attack, check_detector, check_estimator
+from holdfast.testing.common import check_part
 
 PLANT = linear_plant(
     A=[[0.9]], B=[[1.0]], C=[[1.0], [1.0]], G=[[1.0]], H=[[0.0], [0.0]], Q=[[1.0]], R=np.eye(2)
@@ -221,6 +222,6 @@ def test_parts_are_frozen_and_final():
     with pytest.raises(AssertionError, match="Heir: derives from"):
         check_attack(Heir(inner, lambda i: i), PLANT)
     with pytest.raises(AssertionError, match="Window: is not a Detector"):
-        check_detector(inner, PLANT)
+        check_part(inner, Detector)
     with pytest.raises(AssertionError, match="Loose: is not frozen"):
         check_attack(Loose(), PLANT)

@@ -151,7 +151,6 @@ def test_compiled_code_is_kept_in_a_folder_of_ones_own(tmp_path, monkeypatch):
     assert runtime.cache_folder() is None
 
 
-@pytest.mark.skipif(os.name != "posix", reason="modes of POSIX")
 def test_a_folder_that_others_can_write_to_is_not_used(tmp_path, monkeypatch):
     shared = tmp_path / "shared"
     shared.mkdir()

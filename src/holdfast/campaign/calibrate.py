@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import beta
+from scipy.special import betaincinv
 
 from holdfast.campaign.attack_free import Judged, attack_free, horizon
 from holdfast.detectors.chi_square import ChiSquare
@@ -293,7 +293,7 @@ def from_log(monitor: Monitor, observations: Observation) -> tuple[Monitor, Cali
     else:
         value = _above(np.sort(ratio)[::-1][alarms])
     free = n / _correlation_rows(ratio)
-    upper = float(beta.ppf(0.95, alarms * free / n + 1.0, free * (1.0 - alarms / n)))
+    upper = float(betaincinv(alarms * free / n + 1.0, free * (1.0 - alarms / n), 0.95))
     seen = f"{n} attack-free rows (worth {free:.0f} independent ones)"
     if level * (n + 1) < 1.0:
         needed = int(np.ceil(np.log(0.05) / np.log1p(-level)))

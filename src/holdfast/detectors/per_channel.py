@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from holdfast.detectors.settings import by_dof, checked, no_channels, tested
 from holdfast.parts import Detector, Plant
@@ -71,6 +71,6 @@ def build(
     each = np.full(s.most, s.level)
     if s.rule == "calibrated":
         each = -np.expm1(np.log1p(-s.level) / tests)
-    table = norm.isf(each / 2.0) if s.rule != "given" else np.full(s.most, s.number)
+    table = -ndtri(each / 2.0) if s.rule != "given" else np.full(s.most, s.number)
     one = jnp.asarray(1.0, float)
     return PerChannel(jnp.asarray(s.level, float), by_dof(table), one, s.on, s.rule)

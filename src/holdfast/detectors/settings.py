@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from holdfast.parts import InvalidValue, Plant
 from holdfast.records import Estimate
@@ -65,7 +65,7 @@ def no_channels() -> Array:
 
 def chi_square_table(level: float, most: int) -> np.ndarray:
     """The upper ``level`` quantile of chi-square for 0 to ``most`` dof; 0 at 0."""
-    return np.concatenate([[0.0], chi2.isf(level, np.arange(1, most + 1))])
+    return np.concatenate([[0.0], chdtri(np.arange(1, most + 1), level)])
 
 
 def by_dof(values: np.ndarray) -> Float[Array, " m"]:

@@ -9,8 +9,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.optimize import root_scalar
-from scipy.special import hyp0f1
-from scipy.stats import chi2
+from scipy.special import chdtr, chdtri, hyp0f1
 
 from holdfast.parts import InvalidValue
 
@@ -23,16 +22,16 @@ def increments(shift: float, dof: int) -> tuple[Callable, float, float]:
 
     F is its distribution function, ``low`` its least value, ``sd`` its standard deviation.
     """
-    root = np.linspace(0.0, np.sqrt(chi2.isf(1e-15, dof)), 2000)
+    root = np.linspace(0.0, np.sqrt(chdtri(dof, 1e-15)), 2000)
     value = np.log(hyp0f1(dof / 2.0, (shift * root) ** 2 / 4.0)) - shift**2 / 2.0
     # the statistic is a smooth function of its ratio; its distribution function is not
     statistic = CubicSpline(value, root**2)
 
     def distribution(ratio: np.ndarray) -> np.ndarray:
         inside = np.clip(ratio, value[0], value[-1])
-        return np.where(ratio <= value[0], 0.0, chi2.cdf(statistic(inside), dof))
+        return np.where(ratio <= value[0], 0.0, chdtr(dof, statistic(inside)))
 
-    middle = chi2.cdf(root**2, dof)
+    middle = chdtr(dof, root**2)
     mass = np.diff(middle)
     centre = 0.5 * (value[1:] + value[:-1])
     mean = centre @ mass

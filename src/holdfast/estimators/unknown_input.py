@@ -101,7 +101,7 @@ class UnknownInput(Estimator):
         m = self.plant.at(k, state.x, u)
         x = dot(m.A, state.x) + dot(m.G, state.d) + dot(m.B, u)
         move = _move(m)
-        P = sandwich(move, state.P).at[:n, :n].add(m.Q)
+        P = sandwich(move, state.P) + jnp.pad(m.Q, (0, 2 * nd))
         m = self.plant.at(k, x, u)
         trusted = observation.trusted
         H = jnp.where(trusted[:, None], 0.0, m.H)
@@ -136,10 +136,11 @@ class UnknownInput(Estimator):
 
     def _estimate(self, z, P, unknown, direct, residual, residual_cov, status) -> Estimate:
         n, nd, _ = (len(names) for names in _names(self.plant))
-        rows = n + jnp.arange(nd) + jnp.where(direct, 0, nd)
-        d = jnp.where(unknown[rows], 0.0, z[rows])
-        d_cov = _with_unknown(P[rows[:, None], rows[None, :]], unknown[rows])
-        lost = jnp.any(unknown[:n]) | jnp.any(unknown[rows])
+        rows = jnp.concatenate([jnp.diag(direct), jnp.diag(~direct)], 1).astype(float)
+        hidden = jnp.where(direct, unknown[n : n + nd], unknown[n + nd :])
+        d = jnp.where(hidden, 0.0, dot(rows, z[n:]))
+        d_cov = _with_unknown(sandwich(rows, P[n:, n:]), hidden)
+        lost = jnp.any(unknown[:n]) | jnp.any(hidden)
         limits = self.plant.constraints
         return Estimate(
             x=z[:n],
@@ -158,8 +159,8 @@ class UnknownInput(Estimator):
 
 def find_structure(W, sense, free, keep: int) -> Structure:
     """What whitened measurements W y = W sense z + noise settle; z's first ``keep`` stay."""
-    bound = jnp.abs(W) @ (jnp.abs(sense) @ jnp.abs(free))
-    parts = split(W @ (sense @ free), bound)
+    bound = dot(jnp.abs(W), dot(jnp.abs(sense), jnp.abs(free)))
+    parts = split(dot(W, dot(sense, free)), bound)
     left = leftover(free, parts)
     return Structure(parts, echelon(left[:keep]), undetermined(left))
 
@@ -217,7 +218,7 @@ def _new_attack(H, trusted, n: int) -> Float[Array, "w nd"]:
         lambda: leftover(jnp.eye(nd), split(rows, jnp.abs(rows))),
         lambda: jnp.eye(nd),
     )
-    return jnp.zeros((n + 2 * nd, nd)).at[n : n + nd].set(free)
+    return jnp.concatenate([jnp.zeros((n, nd)), free, jnp.zeros((nd, nd))])
 
 
 def _with_unknown(cov: Float[Array, "m m"], unknown: Bool[Array, " m"]) -> Float[Array, "m m"]:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import stats
+from scipy.special import chdtri, ndtri
 
 from holdfast.numerics.linalg import mahalanobis
 
@@ -139,7 +139,7 @@ def consistency(
         return Consistency(np.nan, np.nan, np.nan, 0, 0.0)
     worth = 1.0 if white else 1.0 / correlation_time(values, used)
     tail, nu = (1 - confidence) / 2, total * worth
-    low, high = stats.chi2.ppf([tail, 1 - tail], nu) / nu
+    low, high = chdtri(nu, [1 - tail, tail]) / nu
     ratio = float(values[used].sum() / total)
     return Consistency(ratio, float(low), float(high), rows, rows * worth)
 
@@ -171,7 +171,7 @@ def share(count: int, of: int, *, confidence: float = 0.95) -> Share:
     """
     if of == 0:
         return Share(np.nan, np.nan, np.nan, 0, 0)
-    z = float(stats.norm.ppf(0.5 + confidence / 2))
+    z = float(ndtri(0.5 + confidence / 2))
     p = count / of
     centre = (p + z * z / (2 * of)) / (1 + z * z / of)
     half = z * np.sqrt(p * (1 - p) / of + z * z / (4 * of * of)) / (1 + z * z / of)
@@ -241,9 +241,9 @@ def event_rate(count: int, duration: float, *, confidence: float = 0.95) -> Rate
     if not duration > 0:
         return Rate(np.nan, np.nan, np.nan, np.nan, int(count), 0.0)
     tail = (1 - confidence) / 2
-    low = stats.chi2.ppf(tail, 2 * count) / 2 if count else 0.0
-    high = stats.chi2.ppf(1 - tail, 2 * count + 2) / 2
-    upper = stats.chi2.ppf(confidence, 2 * count + 2) / 2
+    low = chdtri(2 * count, 1 - tail) / 2 if count else 0.0
+    high = chdtri(2 * count + 2, tail) / 2
+    upper = chdtri(2 * count + 2, 1 - confidence) / 2
     rate, low, high, upper = (float(v / duration) for v in (count, low, high, upper))
     return Rate(rate, low, high, upper, int(count), float(duration))
 
@@ -309,5 +309,5 @@ def roc(statistic: ArrayLike, attacked: ArrayLike, *, confidence: float = 0.95) 
     if bad.size < 2 or good.size < 2:
         return Roc(thresholds, false, true, auc, np.nan, np.nan)
     sd = np.sqrt(above.var(ddof=1) / bad.size + below.var(ddof=1) / good.size)
-    half = float(stats.norm.ppf(0.5 + confidence / 2) * sd)
+    half = float(ndtri(0.5 + confidence / 2) * sd)
     return Roc(thresholds, false, true, auc, max(0.0, auc - half), min(1.0, auc + half))

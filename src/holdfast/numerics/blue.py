@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from holdfast.numerics.linalg import (
     RANK_TOLERANCE,
@@ -69,6 +69,8 @@ def split(T: Float[Array, "p q"], bound: Float[Array, "p q"]) -> Split:
     cancellation: a column is zero where it is below `RANK_TOLERANCE` of that.
     """
     p, q = T.shape
+    if q == 0:
+        return Split(jnp.eye(p), T, T)
     rows, columns = jnp.arange(p), jnp.arange(q)
     size = jnp.sum(bound * bound, 0)
     scale = jnp.where(size > 0, 1.0 / jnp.where(size > 0, size, 1.0), 0.0)
@@ -77,9 +79,9 @@ def split(T: Float[Array, "p q"], bound: Float[Array, "p q"]) -> Split:
         rotation, mapped, pivot = carry
         below = jnp.where((rows >= i)[:, None], mapped, 0.0)
         norms = jnp.sum(below * below, 0) * scale * (1.0 - jnp.sum(pivot, 0))
-        best = jnp.argmax(norms)
-        ok = norms[best] > RANK_TOLERANCE**2
-        chosen = jnp.where(columns == best, 1.0, 0.0)
+        ok = jnp.max(norms) > RANK_TOLERANCE**2
+        best = columns == _first_largest(norms)
+        chosen = jnp.where(best, 1.0, 0.0)
         x = jnp.sum(below * chosen, 1)
         length = jnp.sqrt(jnp.sum(x * x))
         head = jnp.sum(jnp.where(rows == i, x, 0.0))
@@ -88,7 +90,7 @@ def split(T: Float[Array, "p q"], bound: Float[Array, "p q"]) -> Split:
         beta = jnp.where(ok & (norm > 0), 2.0 / jnp.where(norm > 0, norm, 1.0), 0.0)
         mapped = mapped - (beta * v)[:, None] * dot(v, mapped)
         rotation = rotation - (beta * v)[:, None] * dot(v, rotation)
-        consumed = ok & (rows > i)[:, None] & (columns == best)
+        consumed = ok & (rows > i)[:, None] & best
         added = jnp.where(ok & (rows == i)[:, None], chosen, 0.0)
         return rotation, jnp.where(consumed, 0.0, mapped), pivot + added
 
@@ -99,14 +101,18 @@ def split(T: Float[Array, "p q"], bound: Float[Array, "p q"]) -> Split:
 
 
 def _correct(
-    joint: Float[Array, "m j"], h: Float[Array, " m"], k: Float[Array, " m"], unit: Any
+    joint: Float[Array, "m j"],
+    along: Float[Array, " j"],
+    h: Float[Array, " m"],
+    k: Float[Array, " m"],
+    unit: Float[Array, " p"],
 ) -> Float[Array, "m j"]:
-    """[P, K] after the unit-noise row h with any gain k, in Joseph's form.
+    """[P, K] after the unit-noise row h with any gain k, in Joseph's form; along = h [P, K].
 
     P <- (I - k h) P (I - k h)' + k k',  K <- (I - k h) K + k e'.
     """
     m = h.shape[0]
-    joint = joint - k[:, None] * dot(h, joint)
+    joint = joint - k[:, None] * along
     twice = (k - dot(joint[:, :m], h))[:, None] * k
     return joint + jnp.concatenate([twice, k[:, None] * unit], 1)
 
@@ -119,9 +125,9 @@ def absorb_known(
     rows = jnp.arange(p)
 
     def row(i, joint):
-        along = dot(joint[:, :m], M[i])
-        unit = jnp.where(rows == i, 1.0, 0.0)
-        return _correct(joint, M[i], along / (dot(along, M[i]) + 1.0), unit)
+        along = dot(M[i], joint)
+        gain = along[:m] / (dot(along[:m], M[i]) + 1.0)
+        return _correct(joint, along, M[i], gain, jnp.where(rows == i, 1.0, 0.0))
 
     joint = repeat(p, row, jnp.concatenate([P, jnp.zeros((m, p))], 1))
     return joint[:, m:], symmetric(joint[:, :m])
@@ -146,10 +152,11 @@ def absorb(
         joint, solved = carry
         i = p - 1 - step
         h, unit = rotated[i], jnp.where(rows == i, 1.0, 0.0)
-        along = dot(joint[:, :m], h)
-        k = jnp.where(used[i], columns[:, i], along / (dot(along, h) + 1.0))
-        weight = (unit - dot(h, joint[:, m:])) / heads[i]
-        return _correct(joint, h, k, unit), solved + parts.pivot[i][:, None] * weight
+        along = dot(h, joint)
+        kalman = along[:m] / (dot(along[:m], h) + 1.0)
+        k = jnp.where(used[i], columns[:, i], kalman)
+        weight = (unit - along[m:]) / heads[i]
+        return _correct(joint, along, h, k, unit), solved + parts.pivot[i][:, None] * weight
 
     start = (jnp.concatenate([P, jnp.zeros((m, p))], 1), jnp.zeros((free.shape[1], p)))
     joint, solved = repeat(p, row, start)
@@ -171,14 +178,14 @@ def leftover(free: Float[Array, "m q"], parts: Split) -> Float[Array, "m q"]:
         pivot = parts.pivot[i]
         head = jnp.where(jnp.sum(pivot) > 0, jnp.sum(pivot * parts.map[i]), 1.0)
         through = parts.map[i] * (1.0 - pivot)
-        rest = parts.map[i] * open_columns - through @ follow
-        size = jnp.abs(parts.map[i]) + jnp.abs(through) @ jnp.abs(follow)
+        rest = parts.map[i] * open_columns - dot(through, follow)
+        size = jnp.abs(parts.map[i]) + dot(jnp.abs(through), jnp.abs(follow))
         rest = jnp.where(jnp.abs(rest) > RANK_TOLERANCE * size, rest, 0.0)
         return follow + pivot[:, None] * rest / head
 
     follow = jax.lax.fori_loop(0, p, row, jnp.zeros((q, q)))
-    size = jnp.abs(free) + jnp.abs(free) @ jnp.abs(follow)
-    left = (free - free @ follow) * open_columns
+    size = jnp.abs(free) + dot(jnp.abs(free), jnp.abs(follow))
+    left = (free - dot(free, follow)) * open_columns
     return jnp.where(jnp.abs(left) > RANK_TOLERANCE * size, left, 0.0)
 
 
@@ -197,27 +204,37 @@ def echelon(N: Float[Array, "m q"]) -> Float[Array, "m m"]:
             jnp.abs(work) / jnp.where(size > 0, size, 1.0),
             0.0,
         )
-        i, j = jnp.unravel_index(jnp.argmax(relative), (m, q))
-        ok = relative[i, j] > RANK_TOLERANCE
-        head = jnp.where(ok, work[i, j], 1.0)
-        column = jnp.where(rows == i, 1.0, work[:, j] / head)
-        column = jnp.where(jnp.abs(work[:, j]) > RANK_TOLERANCE * size[:, j], column, 0.0)
-        others = jnp.where(columns == j, 0.0, work[i])
-        cleared = jnp.where(rows[:, None] == i, 0.0, work - column[:, None] * others)
+        ok = jnp.max(relative) > RANK_TOLERANCE
+        place = _first_largest(relative.ravel())
+        here, there = rows == place // q, columns == place % q
+        pivot_row = jnp.sum(jnp.where(here[:, None], work, 0.0), 0)
+        pivot_column = jnp.sum(jnp.where(there, work, 0.0), 1)
+        head = jnp.where(ok, jnp.sum(jnp.where(there, pivot_row, 0.0)), 1.0)
+        bound = jnp.sum(jnp.where(there, size, 0.0), 1)
+        real = jnp.abs(pivot_column) > RANK_TOLERANCE * bound
+        column = jnp.where(here, 1.0, jnp.where(real, pivot_column / head, 0.0))
+        others = jnp.where(there, 0.0, pivot_row)
+        cleared = jnp.where(here[:, None], 0.0, work - column[:, None] * others)
         grown = size + jnp.abs(column)[:, None] * jnp.abs(others)
         # earlier basis columns lose their entry on the new pivot row: reduced form
-        reduced = basis - column[:, None] * basis[i]
+        reduced = basis - column[:, None] * jnp.sum(jnp.where(here[:, None], basis, 0.0), 0)
         basis = jnp.where(rows == r, column[:, None], reduced)
         return (
             jnp.where(ok, cleared, work),
             jnp.where(ok, grown, size),
             jnp.where(ok, basis, carry[2]),
-            open_rows & ~(ok & (rows == i)),
-            open_columns & ~(ok & (columns == j)),
+            open_rows & ~(ok & here),
+            open_columns & ~(ok & there),
         )
 
     start = (N, jnp.abs(N), jnp.zeros((m, m)), jnp.ones(m, bool), jnp.ones(q, bool))
     return jax.lax.fori_loop(0, min(m, q), pivot, start)[2]
+
+
+def _first_largest(values: Float[Array, " m"]) -> Int[Array, ""]:
+    """argmax as two plain reductions, which XLA's CPU backend compiles into a loop's kernel."""
+    index = jnp.arange(values.shape[0])
+    return jnp.min(jnp.where(values == jnp.max(values), index, values.shape[0]))
 
 
 def undetermined(N: Float[Array, "m q"]) -> Bool[Array, " m"]:

