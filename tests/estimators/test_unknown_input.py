@@ -1,14 +1,14 @@
 """What `unknown_input` says of attacks it cannot see, of authenticated samples, of units."""
 
 import numpy as np
-import oracles
 import pytest
-import systems
-from systems import estimates
 
+import oracles
+import systems
 from holdfast.estimators import kalman, unknown_input
 from holdfast.plants.build import linear_plant
 from holdfast.records import Status
+from systems import estimates
 
 DT = 0.1
 
@@ -30,9 +30,7 @@ def test_a_push_on_a_cart_with_a_position_sensor_is_hidden_in_its_own_row():
     assert np.all(np.isinf(got.x_cov[:, 1, 1]))
     assert np.all(np.isinf(got.d_cov[:, 0, 0]))
     assert np.all(got.d == 0)
-    answer = oracles.batch_estimate(
-        systems.matrices(plant), np.zeros(2), np.eye(2), u, y, seen
-    )
+    answer = oracles.batch_estimate(systems.matrices(plant), np.zeros(2), np.eye(2), u, y, seen)
     np.testing.assert_allclose(got.x[-1, 0], float(answer.value[0]), rtol=1e-12)
     np.testing.assert_allclose(got.x_cov[-1, 0, 0], float(answer.cov[0, 0]), rtol=1e-12)
 

@@ -1,11 +1,6 @@
 """One simulated flight for all tests of the report."""
 
-import sys
-from pathlib import Path
-
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
 
 import demo
 

@@ -3,10 +3,10 @@
 import re
 from xml.etree import ElementTree
 
-import demo
 import numpy as np
 import pytest
 
+import demo
 from holdfast.evaluate.scores import TradeOff
 from holdfast.report import drawing, figures
 from holdfast.report.tables import dataset

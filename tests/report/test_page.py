@@ -3,7 +3,6 @@
 import json
 from html.parser import HTMLParser
 
-import demo
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import demo
 from holdfast.records import Reason
 from holdfast.report import page, words
 from holdfast.report.tables import dataset, summary

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 
-import demo
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import demo
 from holdfast.plants.build import linear_plant
 from holdfast.records import Injection, Reason, Status
 from holdfast.report.tables import channel_names, dataset, summary

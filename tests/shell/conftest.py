@@ -2,15 +2,11 @@
 
 import io
 import sys
-from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
-
-from shell_samples import LOG, SCENARIO
-
 from holdfast.shell import cli
+from shell_samples import LOG, SCENARIO
 
 
 @pytest.fixture(autouse=True)

@@ -2,18 +2,18 @@
 
 import io
 import os
-from pathlib import Path
 import warnings
 import zipfile
+from pathlib import Path
 
 import hypothesis
 import hypothesis.strategies as st
 import numpy as np
 import pytest
-from shell_samples import LOG, SCENARIO
 
 from holdfast.shell.errors import InputError
 from holdfast.shell.files import read_log, read_scenario
+from shell_samples import LOG, SCENARIO
 
 EYE = "[[1.0, 0.0], [0.0, 1.0]]"
 

@@ -1,7 +1,6 @@
 """The commands: run, new, info, help; and what surrounds them."""
 
 import json
-import os
 import re
 import subprocess
 import sys

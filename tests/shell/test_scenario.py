@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.io
-from shell_samples import SCENARIO
 
 from holdfast.attacks.window import Window
 from holdfast.detectors.chi_square import ChiSquare
@@ -15,6 +14,7 @@ from holdfast.estimators.kalman import Kalman
 from holdfast.plants.linear import Table
 from holdfast.shell.errors import InputError
 from holdfast.shell.files import load_scenario, read_scenario
+from shell_samples import SCENARIO
 
 A = [[1.0, 0.1], [0.0, 1.0]]
 INLINE = "A = [[1.0, 0.1], [0.0, 1.0]]"

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtri, ndtri
+from scipy.stats import rankdata
 
 from holdfast.numerics.linalg import mahalanobis
 
@@ -302,9 +303,9 @@ def roc(statistic: ArrayLike, attacked: ArrayLike, *, confidence: float = 0.95) 
     thresholds = np.concatenate([[np.inf], np.unique(statistic)[::-1]])
     false = 1 - np.searchsorted(np.sort(good), thresholds, side="left") / good.size
     true = 1 - np.searchsorted(np.sort(bad), thresholds, side="left") / bad.size
-    ranks = stats.rankdata(np.concatenate([bad, good]))
-    above = (ranks[: bad.size] - stats.rankdata(bad)) / good.size
-    below = 1 - (ranks[bad.size :] - stats.rankdata(good)) / bad.size
+    ranks = rankdata(np.concatenate([bad, good]))
+    above = (ranks[: bad.size] - rankdata(bad)) / good.size
+    below = 1 - (ranks[bad.size :] - rankdata(good)) / bad.size
     auc = float(above.mean())
     if bad.size < 2 or good.size < 2:
         return Roc(thresholds, false, true, auc, np.nan, np.nan)

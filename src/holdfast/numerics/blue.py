@@ -13,7 +13,7 @@ inverses of innovation covariances, and Joseph's form, so that a prior of 1e8 ne
 of 1e-8 loses nothing.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -232,7 +232,7 @@ def echelon(N: Float[Array, "m q"]) -> Float[Array, "m m"]:
 
 
 def _first_largest(values: Float[Array, " m"]) -> Int[Array, ""]:
-    """argmax as two plain reductions, which XLA's CPU backend compiles into a loop's kernel."""
+    """Argmax as two plain reductions, which XLA's CPU backend compiles into a loop's kernel."""
     index = jnp.arange(values.shape[0])
     return jnp.min(jnp.where(values == jnp.max(values), index, values.shape[0]))
 

@@ -73,7 +73,9 @@ def weighted_quantile(level: float, weights: np.ndarray, dof: np.ndarray) -> flo
     def excess(x: float) -> float:
         return float(np.log(max(weighted_tail(x, w, nu), 1e-300) / level))
 
-    return float(root_scalar(excess, bracket=(low, high), rtol=1e-12).root)
+    # either end may be the quantile itself, where the tail's rounding decides the sign
+    bracket = (low * (1 - 1e-6), high * (1 + 1e-6))
+    return float(root_scalar(excess, bracket=bracket, rtol=1e-12).root)
 
 
 class SumQuantile(eqx.Module):

@@ -20,7 +20,7 @@ direction that a sensor sees at all leaves R / (CPC' + R), above 1e-10 unless th
 
 
 def dot(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
-    """a @ b for matrices and vectors, as a fusible sum where the matrices are small.
+    """A @ b for matrices and vectors, as a fusible sum where the matrices are small.
 
     A matrix that a batch shares times the batch's vectors is one matrix product of the whole
     batch: seven times faster than 1024 sums.
@@ -63,7 +63,7 @@ def symmetric(p: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def repeat(count: int, body: Callable[[Any, Any], Any], carry: Any) -> Any:
-    """carry <- body(i, carry) for i = 0 .. count-1."""
+    """Carry <- body(i, carry) for i = 0 .. count-1."""
     return jax.lax.fori_loop(0, count, body, carry)
 
 

@@ -102,7 +102,7 @@ class Live:
         view = self._views.get(address)
         if view is None:
             raw = (ctypes.c_double * self._size).from_address(address)
-            view = self._views[address] = np.frombuffer(raw)
+            view = self._views[address] = np.frombuffer(memoryview(raw))
         return view.copy()
 
     def _outcome(self, state, sample):
