@@ -202,9 +202,9 @@ class Knowledge(eqx.Module):
 class Injection(eqx.Module):
     """What an attacker adds at step k: to the actuators, the sensors, the attack channels."""
 
-    u: Float[Array, " nu"]
-    y: Float[Array, " ny"]
-    d: Float[Array, " nd"]
+    u: Float[Array, "*t nu"]
+    y: Float[Array, "*t ny"]
+    d: Float[Array, "*t nd"]
 
 
 class Trace(eqx.Module):

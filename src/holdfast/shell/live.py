@@ -95,9 +95,9 @@ class Live:
     def _outcome_of(self, flat: jax.Array) -> np.ndarray:
         """A copy of the outcome, read at the array's address: 3 us less than `np.asarray`.
 
-        The call was synchronous, so the numbers are there; they are copied before the next
-        call, to which the array is donated.
+        They are copied before the next call, to which the array is donated.
         """
+        flat.block_until_ready()
         address = flat.unsafe_buffer_pointer()
         view = self._views.get(address)
         if view is None:
@@ -167,7 +167,7 @@ def _reader(kind: type[T], slots: list[_Slot]) -> Callable[[np.ndarray], T]:
         fields = dict.fromkeys(names)
         fields.update(always)
         for name, part, dtype in vectors:
-            fields[name] = values[part] if dtype == float else values[part].astype(dtype)
+            fields[name] = values[part].astype(dtype, copy=False)
         for name, part, shape in matrices:
             fields[name] = values[part].reshape(shape)
         for name, at, convert in scalars:
