@@ -7,8 +7,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.linalg import solve_triangular
 
-from holdfast.numerics.blue import whitener
 from holdfast.numerics.sampling import sample
 from holdfast.parts import InvalidValue
 from holdfast.plants.linear import Constraints, LinearPlant, Sampling, Table
@@ -72,10 +72,9 @@ def linear_plant(
     limits = _constraints(constraints or {}, *(len(names[k]) for k in names if k != "outputs"))
     arrays: dict[str, Any] = {key: _mapped(jnp.asarray, value) for key, value in found.items()}
     constant_R = not isinstance(found["R"], Table) and found["R"].ndim == 2
-    everything = jnp.ones(len(names["outputs"]), bool)
     return LinearPlant(
         **arrays,
-        white=jax.jit(whitener)(arrays["R"], everything) if constant_R else None,
+        white=_whitening(found["R"]) if constant_R else None,
         constraints=limits,
         dt=float(dt),
         states=names["states"],
@@ -193,6 +192,12 @@ def covariance(key: str, m: Any) -> np.ndarray:
             key, f"smallest eigenvalue {lowest:.3g}", "a covariance (no negative eigenvalue)"
         )
     return m
+
+
+def _whitening(R: np.ndarray) -> tuple[jax.Array, jax.Array]:
+    """W with W R W' = I, and its inverse, once for all rows at which everything is seen."""
+    lower = np.linalg.cholesky(R)
+    return jnp.asarray(solve_triangular(lower, np.eye(len(R)), lower=True)), jnp.asarray(lower)
 
 
 def _schedule(
