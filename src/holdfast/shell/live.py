@@ -171,7 +171,7 @@ def _reader(kind: type[T], slots: list[_Slot]) -> Callable[[np.ndarray], T]:
         for name, part, shape in matrices:
             fields[name] = values[part].reshape(shape)
         for name, at, convert in scalars:
-            fields[name] = convert(values[at])
+            fields[name] = values[at] if convert is np.float64 else convert(values[at])
         record = object.__new__(kind)
         object.__setattr__(record, "__dict__", fields)
         return record
