@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"
+os.environ["HOLDFAST_CACHE"] = "off"  # tests compile what they test
 
 import hypothesis
 import jax

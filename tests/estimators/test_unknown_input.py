@@ -95,3 +95,16 @@ def test_the_residual_is_blind_to_the_attack_and_counts_what_is_left():
     np.testing.assert_allclose(attacked.residual, honest.residual, atol=1e-9)
     np.testing.assert_allclose(attacked.d - honest.d, 1e3, rtol=1e-12)
     assert np.linalg.matrix_rank(honest.residual_cov[-1], tol=1e-9) == 2
+
+
+def test_the_attacks_limits_follow_the_input():
+    """A limit on d + u: the bound of d at a row is the limit less that row's input."""
+    plant = linear_plant(
+        A=[[0.9]], B=[[1]], C=[[1]], G=[[1]], Q=[[0.1]], R=[[0.1]],
+        constraints={"attack": {"matrix": [[1], [-1]], "bound": [3, 3], "bound_u": [[-1], [1]]}},
+    )  # fmt: skip
+    u = np.array([[0.5], [-2.0]])
+    got = estimates(
+        unknown_input.build(plant, [0], [[1]]), u, np.zeros((2, 1)), np.ones((2, 1), bool)
+    )
+    np.testing.assert_allclose(got.d_bound, [[2.5, 3.5], [5.0, 1.0]])

@@ -86,6 +86,7 @@ class UnknownInput(Estimator):
             jnp.zeros((n + 2 * nd, n + 2 * nd)).at[:n, :n].set(self.P0),
             unknown,
             jnp.ones(nd, bool),
+            jnp.zeros(len(self.plant.inputs)),
             jnp.zeros(ny),
             jnp.zeros((ny, ny)),
             jnp.asarray(int(Status.OK), jnp.int32),
@@ -122,6 +123,7 @@ class UnknownInput(Estimator):
             update.cov,
             structure.unknown,
             self.direct if self.direct.ndim == 1 else self.direct[k - 1],
+            u,
             dot(blind, innovation),
             sandwich(dot(W_inverse, update.blind), spread),
             observation.status
@@ -134,7 +136,7 @@ class UnknownInput(Estimator):
             k, z[:n], z[n:keep], P, structure.free, plain, known, usual
         ), estimate
 
-    def _estimate(self, z, P, unknown, direct, residual, residual_cov, status) -> Estimate:
+    def _estimate(self, z, P, unknown, direct, u, residual, residual_cov, status) -> Estimate:
         n, nd, _ = (len(names) for names in _names(self.plant))
         rows = jnp.concatenate([jnp.diag(direct), jnp.diag(~direct)], 1).astype(float)
         hidden = jnp.where(direct, unknown[n : n + nd], unknown[n + nd :])
@@ -150,7 +152,7 @@ class UnknownInput(Estimator):
             d_free=d,
             d_free_cov=d_cov,
             d_rows=limits.attack,
-            d_bound=limits.attack_bound,
+            d_bound=limits.attack_bound + dot(limits.attack_bound_u, u),
             residual=residual,
             residual_cov=residual_cov,
             status=status | jnp.where(lost, int(Status.UNOBSERVABLE), 0).astype(jnp.int32),

@@ -11,6 +11,7 @@ import numpy as np
 
 from holdfast.loop import Monitor, monitor_step
 from holdfast.records import Estimate, Observation, Verdict, screen
+from holdfast.shell import runtime
 
 T = TypeVar("T")
 
@@ -33,9 +34,9 @@ class Live:
     """
 
     def __init__(self, monitor: Monitor):
-        # A synchronous call returns as soon as the step is done; a dispatched one takes as
-        # long again to hand over. Without effect if JAX has already computed something.
-        jax.config.update("jax_cpu_enable_async_dispatch", False)
+        # compiled code kept on disk; calls that return when the step is done, where JAX has
+        # not computed anything yet (handing over to another thread costs as much again)
+        runtime.configure()
         plant = monitor.estimator.plant
         self.monitor = monitor
         self._nu, self._ny = len(plant.inputs), len(plant.outputs)
