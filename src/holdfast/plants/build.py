@@ -71,10 +71,11 @@ def linear_plant(
         found, sampling = _discretised(found, dt, method, noise)
     limits = _constraints(constraints or {}, *(len(names[k]) for k in names if k != "outputs"))
     arrays: dict[str, Any] = {key: _mapped(jnp.asarray, value) for key, value in found.items()}
-    constant_R = not isinstance(found["R"], Table) and found["R"].ndim == 2
+    R_found: Any = found["R"]
+    constant_R = isinstance(R_found, np.ndarray) and R_found.ndim == 2
     return LinearPlant(
         **arrays,
-        white=_whitening(found["R"]) if constant_R else None,
+        white=_whitening(R_found) if constant_R else None,
         constraints=limits,
         dt=float(dt),
         states=names["states"],
