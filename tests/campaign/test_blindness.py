@@ -36,10 +36,9 @@ def test_the_sizes_are_those_of_the_closed_form():
         assert one.probability == pytest.approx(one.target, abs=4 * one.standard_error)
     quiet = 1 - 0.999**5
     assert found.false_alarm == pytest.approx(quiet, abs=4 * np.sqrt(quiet / 4000))
-    size = f"{found.found[-1].size:.3g}"
-    assert (
-        found.sentence
-        == f"This gate cannot see a shift of level under {size} (95 % within 5 steps)."
+    half, most = (f"{one.size:.3g}" for one in found.found)
+    assert found.sentence == (
+        f"This gate cannot see a shift of level under {most} (95 % within 5 steps; 50 % at {half})."
     )
 
 

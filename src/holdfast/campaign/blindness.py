@@ -121,7 +121,7 @@ def blindness(
             for j in range(i * len(TARGETS), (i + 1) * len(TARGETS))
         )
         error = float(np.sqrt(without * (1.0 - without) / runs))
-        sentence = _sentence(name, found[-1], without, steps)
+        sentence = _sentence(name, found, without, steps)
         results.append(Blindness(name, steps, found, without, error, runs, seed, sentence))
     return results
 
@@ -166,12 +166,14 @@ def _found(
     return Found(float(target), float(size), float(share), float(error))
 
 
-def _sentence(channel: str, best: Found, without: float, steps: int) -> str:
+def _sentence(channel: str, found: tuple[Found, ...], without: float, steps: int) -> str:
+    even, best = found
     kind, name = channel.split(":", 1)
     what = f"a shift of {name}" if kind == "sensor" else f"a constant {name}"
     within = f"{best.target:.0%} within {steps} steps".replace("%", " %")
     if best.size is not None:
-        return f"This gate cannot see {what} under {best.size:.3g} ({within})."
+        half = f"; {even.target:.0%} at {even.size:.3g}".replace("%", " %") if even.size else ""
+        return f"This gate cannot see {what} under {best.size:.3g} ({within}{half})."
     if without >= best.target:
         return (
             f"Nothing can be said of {what}: without any attack an alarm comes within {steps} "
