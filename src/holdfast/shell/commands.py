@@ -128,13 +128,22 @@ def _report(
                 title=title,
                 scenario_text=source,
                 summary=summary(trace, plant, time),
-                calibration=dataclasses.asdict(how),
+                calibration=_told(how),
                 blindness=sentences,
                 notes=notes,
             )
         except OSError as error:
             raise unwritable(folder, error) from None
     print(page)
+
+
+def _told(how: Calibration) -> dict[str, Any]:
+    """What there is to tell of a calibration: no counts of a simulation that was not needed."""
+    return {
+        name: value
+        for name, value in dataclasses.asdict(how).items()
+        if value is not None and (value != 0 or name == "seed")
+    }
 
 
 def _print_scores(scores: Mapping[str, Any]) -> None:
