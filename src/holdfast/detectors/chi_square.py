@@ -6,7 +6,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from holdfast.detectors.settings import by_dof, checked, chi_square_table, no_channels, tested
+from holdfast.detectors.settings import (
+    by_dof,
+    checked,
+    chi_square_table,
+    no_channels,
+    tested,
+    verdict,
+)
 from holdfast.numerics.linalg import mahalanobis
 from holdfast.parts import Detector, Plant
 from holdfast.records import Estimate, Reason, Verdict
@@ -40,10 +47,8 @@ class ChiSquare(Detector):
         """The verdict on one row."""
         statistic, dof = mahalanobis(*tested(estimate, self.on))
         threshold = self.factor * self.table[dof]
-        alarm = statistic > threshold
-        code = Reason.ATTACK if self.on == "attack" else Reason.RESIDUAL
-        reason = jnp.where(alarm, int(code), 0).astype(jnp.int32)
-        return state, Verdict(statistic, threshold, alarm, reason, no_channels())
+        codes = Reason.ATTACK, Reason.RESIDUAL
+        return state, verdict(statistic, threshold, self.on, codes)
 
 
 def build(

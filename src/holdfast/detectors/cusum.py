@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from holdfast.detectors.settings import checked, chi_square_table, no_channels, tested
+from holdfast.detectors.settings import checked, chi_square_table, tested, verdict
 from holdfast.numerics.chi_square import SumQuantile, sum_quantile
 from holdfast.numerics.linalg import mahalanobis
 from holdfast.parts import Detector, InvalidValue, Plant
@@ -81,10 +81,8 @@ class Cusum(Detector):
             limit = self.quantile.at(*jnp.where(something, state.moments, 1.0))
         statistic = jnp.where(something, state.sum, 0.0)
         threshold = jnp.where(something, self.factor * limit, jnp.inf)
-        alarm = statistic > threshold
-        code = Reason.ATTACK_SUM if self.on == "attack" else Reason.RESIDUAL_SUM
-        reason = jnp.where(alarm, int(code), 0).astype(jnp.int32)
-        return state, Verdict(statistic, threshold, alarm, reason, no_channels())
+        codes = Reason.ATTACK_SUM, Reason.RESIDUAL_SUM
+        return state, verdict(statistic, threshold, self.on, codes)
 
 
 def build(

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.special import ndtri
 
-from holdfast.detectors.settings import by_dof, checked, no_channels, tested
+from holdfast.detectors.settings import by_dof, checked, no_channels, tested, verdict
 from holdfast.parts import Detector, Plant
 from holdfast.records import Estimate, Reason, Verdict
 
@@ -49,10 +49,8 @@ class PerChannel(Detector):
         z = jnp.where(used, jnp.abs(v) / jnp.sqrt(jnp.where(used, variance, 1.0)), 0.0)
         statistic = jnp.max(z, initial=0.0)
         threshold = self.factor * self.table[jnp.sum(used)]
-        alarm = statistic > threshold
-        code = Reason.ATTACK_CHANNEL if self.on == "attack" else Reason.RESIDUAL_CHANNEL
-        reason = jnp.where(alarm, int(code), 0).astype(jnp.int32)
-        return state, Verdict(statistic, threshold, alarm, reason, z > threshold)
+        codes = Reason.ATTACK_CHANNEL, Reason.RESIDUAL_CHANNEL
+        return state, verdict(statistic, threshold, self.on, codes, z > threshold)
 
 
 def build(

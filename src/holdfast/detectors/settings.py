@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from scipy.special import chdtri
 
 from holdfast.parts import InvalidValue, Plant
-from holdfast.records import Estimate
+from holdfast.records import Estimate, Reason, Verdict
 
 
 class Settings(NamedTuple):
@@ -61,6 +61,25 @@ def tested(estimate: Estimate, on: str) -> tuple[Float[Array, " m"], Float[Array
 def no_channels() -> Array:
     """The channel alarms of a detector that does not localise."""
     return jnp.zeros((0,), bool)
+
+
+def verdict(
+    statistic: Float[Array, ""],
+    threshold: Float[Array, ""],
+    on: str,
+    codes: tuple[Reason, Reason],
+    channels: Array | None = None,
+) -> Verdict:
+    """An alarm where the statistic exceeds the threshold, for the reason that goes with ``on``.
+
+    ``codes``: the reason on the attack estimate, and on the residual.
+    """
+    alarm = statistic > threshold
+    code = codes[0] if on == "attack" else codes[1]
+    reason = jnp.where(alarm, int(code), 0).astype(jnp.int32)
+    return Verdict(
+        statistic, threshold, alarm, reason, no_channels() if channels is None else channels
+    )
 
 
 def chi_square_table(level: float, most: int) -> np.ndarray:

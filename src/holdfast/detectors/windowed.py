@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from holdfast.detectors.settings import checked, chi_square_table, no_channels, tested
+from holdfast.detectors.settings import checked, chi_square_table, tested, verdict
 from holdfast.numerics.chi_square import SumQuantile, sum_quantile
 from holdfast.numerics.linalg import mahalanobis
 from holdfast.parts import Detector, InvalidValue, Plant
@@ -64,10 +64,8 @@ class Windowed(Detector):
                 *(jnp.sum(c**power * some) for power in (1, 2, 3)),
             )
         threshold = jnp.where(something, self.factor * limit, jnp.inf)
-        alarm = statistic > threshold
-        code = Reason.ATTACK_WINDOW if self.on == "attack" else Reason.RESIDUAL_WINDOW
-        reason = jnp.where(alarm, int(code), 0).astype(jnp.int32)
-        return state, Verdict(statistic, threshold, alarm, reason, no_channels())
+        codes = Reason.ATTACK_WINDOW, Reason.RESIDUAL_WINDOW
+        return state, verdict(statistic, threshold, self.on, codes)
 
 
 def build(
