@@ -106,12 +106,14 @@ def eliminate(matrix, rhs, count, tolerance=1e-11):
     work, _, rank = pivoted_qr(
         first / column_norms(first), np.column_stack([matrix[:, count:], rhs]), tolerance
     )
-    rest = work[rank:, count:]
-    return rest[:, :-1], rest[:, -1]
+    rest, right = work[rank:, count:-1], work[rank:, -1]
+    # what only rounding (1e-19) leaves of a column would look like information about it
+    noise = np.abs(rest) < 1e-15 * column_norms(matrix[:, count:])
+    return np.where(noise, 0, rest), right
 
 
-def batch_estimate(m, x0, P0, u, y, seen, free_attack: bool = True) -> Answer:
-    """Exact (x_k, d_{k-1}, d_k) from rows 1..k, every attack free (or none at all).
+def batch_estimate(m, x0, P0, u, y, seen, free_attack: bool = True, delay: int = 0) -> Answer:
+    """Exact (x_k, d_{k-1-delay}, ..., d_k) from rows 1..k, every attack free (or none at all).
 
     One weighted least-squares problem in all of x_0..x_k and d_0..d_k (``m``: A, B, C, D, G,
     H, Q, R, constant), solved by orthogonal elimination in the order of time.
@@ -119,29 +121,32 @@ def batch_estimate(m, x0, P0, u, y, seen, free_attack: bool = True) -> Answer:
     A, B, C, D, G, H, Q, R = (np.asarray(v, WIDE) for v in m)
     n, nd = A.shape[0], G.shape[1] if free_attack else 0
     G, H = G[:, :nd], H[:, :nd]
-    eye, none = np.eye(n, dtype=WIDE), np.zeros((n, nd), WIDE)
+    eye, past = np.eye(n, dtype=WIDE), nd * (delay + 1)
     root_P, root_Q = cholesky(np.asarray(P0, WIDE)), cholesky(Q)
-    # what is known of (x_k, d_k); of d_0 nothing is
-    info = forward(root_P, np.hstack([eye, none]))
+    # what is known of (x_k, d_{k-delay}, ..., d_k); of the attacks up to d_0 nothing is
+    info = forward(root_P, np.hstack([eye, np.zeros((n, past), WIDE)]))
     rhs = forward(root_P, np.asarray(x0, WIDE))
+    older = np.zeros((n, past - nd), WIDE)
     answer = None
     for inputs, sample, arrived in zip(u, y, np.asarray(seen, bool), strict=True):
         inputs = np.asarray(inputs, WIDE)
-        # columns: x before | d before, x now, d now
+        # columns: x before | attacks before, x now, d now
         rows = [
             np.hstack([info, np.zeros((len(info), n + nd), WIDE)]),
-            forward(root_Q, np.hstack([-A, -G, eye, none])),
+            forward(root_Q, np.hstack([-A, older, -G, eye, np.zeros((n, nd), WIDE)])),
         ]
         right = [rhs, forward(root_Q, B @ inputs)]
         if arrived.any():
             root_R = cholesky(R[np.ix_(arrived, arrived)])
-            still = np.zeros((arrived.sum(), n + nd), WIDE)
+            still = np.zeros((arrived.sum(), n + past), WIDE)
             rows.append(forward(root_R, np.hstack([still, C[arrived], H[arrived]])))
             right.append(forward(root_R, (np.asarray(sample, WIDE) - D @ inputs)[arrived]))
         info, rhs = eliminate(np.vstack(rows), np.concatenate(right), n)
         answer = least_squares(info, rhs)
         info, rhs = eliminate(info, rhs, nd)
-    order = np.r_[nd : nd + n, 0:nd, nd + n : n + 2 * nd]
+        state = np.r_[past - nd : past - nd + n]
+        info = np.hstack([info[:, state], np.delete(info, state, 1)])
+    order = np.r_[past : past + n, 0:past, past + n : past + n + nd]
     return Answer(
         answer.value[order],
         answer.cov[np.ix_(order, order)],

@@ -9,7 +9,7 @@ from typing import Any
 from holdfast.attacks import bias, delay, freeze, hopping, noise, ramp, replay, sine
 from holdfast.controllers import feedback
 from holdfast.detectors import chi_square, cusum, per_channel, sprt, windowed
-from holdfast.estimators import extended, kalman, unknown_input, unscented
+from holdfast.estimators import care, extended, kalman, unknown_input, unscented
 from holdfast.plants import build
 from holdfast.plants.library import uav
 
@@ -23,6 +23,7 @@ PLANTS: Builders = {
 ESTIMATORS: Builders = {
     "kalman": kalman.build,
     "unknown_input": unknown_input.build,
+    "care": care.build,
     "extended": extended.build,
     "unscented": unscented.build,
 }

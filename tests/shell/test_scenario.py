@@ -125,9 +125,9 @@ def test_constraints(folder):
         "attack = { matrix = [[1], [-1]], bound = [3.5, 2.5], bound_u = [[-1], [1]] }\n[estimator]"
     )
     limits = load(folder, ("[estimator]", text)).scenario.plant.constraints
-    np.testing.assert_array_equal(limits.state, [[1, 0]])
-    np.testing.assert_array_equal(limits.attack_bound, [3.5, 2.5])
-    np.testing.assert_array_equal(limits.attack_bound_u, [[-1], [1]])
+    np.testing.assert_array_equal(limits.state.matrix, [[1, 0]])
+    np.testing.assert_array_equal(limits.attack.bound, [3.5, 2.5])
+    np.testing.assert_array_equal(limits.attack.bound_u, [[-1], [1]])
 
 
 def test_controller(folder):

@@ -1,16 +1,18 @@
 """Minimum-variance unbiased joint estimate of state and attack, the attack wholly free.
 
 Attacks may enter the dynamics (G), the outputs (H) or both, H of any rank, and any sample may
-be missing. The vector (x_k, d_k, d_{k-1}) is carried with what the data leave undetermined
-(`holdfast.numerics.blue`): nothing about d is assumed, so d_k starts free at every step.
-Where C G V2 has full column rank this is the ULISE of Yong, Zhu and Frazzoli; with H = 0 it is
-CARE's Algorithm 1, lines 1 to 13 (line 9 corrected by + Q).
+be missing. The vector (x_k, d_k, ..., d_{k-1-L}) is carried with what the data leave
+undetermined (`holdfast.numerics.blue`): nothing about d is assumed, so d_k starts free at
+every step. Where C G V2 has full column rank and L = 0 this is the ULISE of Yong, Zhu and
+Frazzoli; with H = 0 it is CARE's Algorithm 1, lines 1 to 13 (line 9 corrected by + Q).
+
+An attack that reaches the outputs only after some steps (C G = 0) is determined by later
+data: with ``delay`` L the vector remembers L more attacks, and row k gives the oldest.
 
 Source: CARE (5)-(8), (15), Algorithm 1; NISE (8), Algorithm 1, with the errata of both.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,35 +20,33 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from holdfast.numerics.blue import Split, absorb, echelon, leftover, split, undetermined
-from holdfast.numerics.linalg import RANK_TOLERANCE, dot, sandwich
-from holdfast.parts import Estimator, step_zero
-from holdfast.plants.linear import LinearPlant, Matrices, Table
+from holdfast.estimators.channels import direct_channels, hidden_input
+from holdfast.numerics.blue import (
+    Split,
+    absorb,
+    echelon,
+    leftover,
+    split,
+    undetermined,
+    whitener,
+)
+from holdfast.numerics.linalg import dot, sandwich
+from holdfast.parts import Estimator, InvalidValue, Plant, step_zero
+from holdfast.plants.constraints import limits_of
+from holdfast.plants.linear import LinearPlant
+from holdfast.plants.local import motion, sensing
 from holdfast.records import Estimate, Observation, Status
 
-
-class UnknownInputState(eqx.Module):
-    """(x_k, d_k) with covariance and the basis ``free`` of what is undetermined about them.
-
-    ``plain``: every sample of this row arrived, none authenticated, and they determined x, so
-    that ``free`` is what H does not see. ``usual``: the structure of a plain row after a plain
-    row, once one was met (``known``); a constant plant need not find it again.
-    """
-
-    k: Int[Array, ""]
-    x: Float[Array, " n"]
-    d: Float[Array, " nd"]
-    P: Float[Array, "s s"]
-    free: Float[Array, "s s"]
-    plain: Bool[Array, ""]
-    known: Bool[Array, ""]
-    usual: "Structure | None"
+PASSES = 20
+"""Linearisations of a nonlinear plant at one row, at most."""
+SETTLED = 1e-3
+"""Move of the linearisation point, in standard deviations of the estimate, taken as none."""
 
 
 class Structure(NamedTuple):
     """What a step determines and leaves free, whatever the numbers measured.
 
-    ``free`` is about (x_k, d_k), ``unknown`` about (x_k, d_k, d_{k-1}).
+    ``free`` is about what is carried on, ``unknown`` about all that the row estimates.
     """
 
     parts: Split
@@ -54,96 +54,195 @@ class Structure(NamedTuple):
     unknown: Bool[Array, " l"]
 
 
+class UnknownInputState(eqx.Module):
+    """z = (x_k, d_k, ..., d_{k-L}), its covariance and the basis ``free`` of what is undetermined.
+
+    ``inputs``: u_k back to u_{k-L+1}. A constant plant need not find the structure of a step
+    again once it repeats itself: ``usual`` is then what maps ``free`` onto itself where every
+    sample arrives and none is authenticated, and ``settled`` says that it does.
+    """
+
+    k: Int[Array, ""]
+    z: Float[Array, " s"]
+    P: Float[Array, "s s"]
+    free: Float[Array, "s s"]
+    inputs: Float[Array, "l nu"]
+    settled: Bool[Array, ""]
+    usual: Structure | None
+
+
+class _Point(NamedTuple):
+    """Where a nonlinear plant is linearised: before the step and after it."""
+
+    x_before: Float[Array, " n"]
+    d_before: Float[Array, " nd"]
+    x: Float[Array, " n"]
+    d: Float[Array, " nd"]
+
+
+class _Row(NamedTuple):
+    """What one row estimates: z = (x_k, d_k, ..., d_{k-1-L}), and what of it is unknown."""
+
+    z: Float[Array, " w"]
+    P: Float[Array, "w w"]
+    structure: Structure
+    settled: Bool[Array, ""]
+    usual: Structure | None
+    residual: Float[Array, " ny"]
+    residual_cov: Float[Array, "ny ny"]
+
+
 class UnknownInput(Estimator):
     """x_k and d from y up to k, best linear unbiased with every attack free; see the module.
 
-    ``direct`` marks the channels whose axis lies in the row space of H: they are given at k,
-    the others at k-1 (per step where H is). ``hidden``: some attack that moves the state
-    reaches no output of its own row.
+    ``direct`` marks the channels whose axis lies in the row space of H: they are given at
+    k - L, the others at k - 1 - L (per step where H is). ``hidden``: some attack that moves
+    the state reaches no output of its own row. A nonlinear plant is linearised about the
+    estimates of the same row, again until they settle; NOT_CONVERGED where they do not.
     """
 
-    plant: LinearPlant
+    plant: Plant
     x0: Float[Array, " n"]
     P0: Float[Array, "n n"]
     direct: Bool[Array, "*t nd"]
     hidden: Bool[Array, "*t"]
+    delay: int = eqx.field(static=True)
 
     def init(self) -> tuple[UnknownInputState, Estimate]:
-        """The estimate one sample before the first row; the attack there is free."""
-        n, nd, ny = (len(names) for names in _names(self.plant))
-        P = jnp.zeros((n + nd, n + nd)).at[:n, :n].set(self.P0)
-        free = jnp.diag(jnp.concatenate([jnp.zeros(n), jnp.ones(nd)]))
-        no = jnp.asarray(False)
+        """The estimate one sample before the first row; the attacks up to there are free."""
+        n, nd, ny, nu = self._sizes
+        size = n + nd * (self.delay + 1)
+        P = jnp.zeros((size, size)).at[:n, :n].set(self.P0)
+        unknown = jnp.concatenate([jnp.zeros(n, bool), jnp.ones(size + nd - n, bool)])
+        free = jnp.diag(jnp.where(unknown[:size], 1.0, 0.0))
         usual = None
-        if self.plant.constant:
-            size, rows = n + 2 * nd, jnp.zeros((ny, n + 2 * nd))
-            parts = Split(jnp.eye(ny), rows, rows)
-            usual = Structure(parts, jnp.zeros_like(free), jnp.zeros(size, bool))
-        state = UnknownInputState(step_zero(), self.x0, jnp.zeros(nd), P, free, no, no, usual)
-        unknown = jnp.concatenate([jnp.zeros(n, bool), jnp.ones(2 * nd, bool)])
-        estimate = self._estimate(
-            jnp.concatenate([self.x0, jnp.zeros(2 * nd)]),
-            jnp.zeros((n + 2 * nd, n + 2 * nd)).at[:n, :n].set(self.P0),
-            unknown,
-            jnp.ones(nd, bool),
-            jnp.zeros(len(self.plant.inputs)),
+        if isinstance(self.plant, LinearPlant) and self.plant.constant:
+            rows = jnp.zeros((ny, size + nd))
+            usual = Structure(Split(jnp.eye(ny), rows, rows), jnp.zeros_like(free), unknown)
+        state = UnknownInputState(
+            step_zero(),
+            jnp.concatenate([self.x0, jnp.zeros(size - n)]),
+            P,
+            free,
+            jnp.zeros((self.delay, nu)),
+            jnp.asarray(False),
+            usual,
+        )
+        row = _Row(
+            jnp.pad(state.z, (0, nd)),
+            jnp.pad(P, (0, nd)),
+            Structure(Split(jnp.eye(0), *2 * (jnp.zeros((0, 0)),)), free, unknown),
+            state.settled,
+            usual,
             jnp.zeros(ny),
             jnp.zeros((ny, ny)),
-            jnp.asarray(int(Status.OK), jnp.int32),
         )
-        return state, estimate
+        nothing = jnp.zeros(nu), jnp.asarray(int(Status.OK), jnp.int32)
+        return state, self._estimate(row, jnp.asarray(1, jnp.int32), *nothing)
 
     def step(
         self, state: UnknownInputState, observation: Observation
     ) -> tuple[UnknownInputState, Estimate]:
-        """One row: predict (x, d_now, d_before), determine what can be, correct the rest."""
-        k, u, seen = state.k + 1, observation.u, observation.seen
-        n, nd, ny = (len(names) for names in _names(self.plant))
-        m = self.plant.at(k, state.x, u)
-        x = dot(m.A, state.x) + dot(m.G, state.d) + dot(m.B, u)
-        move = _move(m)
-        P = sandwich(move, state.P) + jnp.pad(m.Q, (0, 2 * nd))
-        m = self.plant.at(k, x, u)
-        trusted = observation.trusted
-        H = jnp.where(trusted[:, None], 0.0, m.H)
-        free = jnp.concatenate([dot(move, state.free), _new_attack(m.H, trusted, n)], 1)
-        sense = jnp.concatenate([m.C, H, jnp.zeros((ny, nd))], 1)
-        W, W_inverse = self.plant.whiten(m.R, seen)
-        whole = jnp.all(seen) & ~jnp.any(trusted)
-        structure, known, usual = _structure(state, whole, W, sense, free)
-        M = dot(W, sense)
-        update = absorb(P, M, free, structure.parts)
-        innovation = jnp.where(seen, observation.y - dot(m.C, x) - dot(m.D, u), 0.0)
-        z = jnp.concatenate([x, jnp.zeros(nd), state.d])
-        z = z + dot(update.gain, dot(W, innovation))
-        blind = dot(dot(W_inverse, update.blind), W)
-        spread = sandwich(M, P) + jnp.eye(ny)
-        estimate = self._estimate(
-            z,
-            update.cov,
-            structure.unknown,
-            self.direct if self.direct.ndim == 1 else self.direct[k - 1],
-            u,
-            dot(blind, innovation),
-            sandwich(dot(W_inverse, update.blind), spread),
-            observation.status
-            | jnp.where(_row(self.hidden, k), int(Status.HIDDEN_INPUT), 0).astype(jnp.int32),
-        )
-        keep = n + nd
-        plain = whole & ~jnp.any(structure.unknown[:n])
-        P = update.cov[:keep, :keep]
+        """One row: predict z, determine what can be, correct the rest."""
+        k, status = state.k + 1, observation.status
+        if isinstance(self.plant, LinearPlant):
+            row = self._row(state, observation, None)
+        else:
+            row, moving = self._relinearised(state, observation)
+            status = status | jnp.where(moving, int(Status.NOT_CONVERGED), 0)
+        hidden = jnp.where(_at_row(self.hidden, k), int(Status.HIDDEN_INPUT), 0)
+        inputs = jnp.concatenate([observation.u[None], state.inputs])
+        estimate = self._estimate(row, k, inputs[-1], (status | hidden).astype(jnp.int32))
+        keep = state.z.shape[0]
         return UnknownInputState(
-            k, z[:n], z[n:keep], P, structure.free, plain, known, usual
+            k,
+            row.z[:keep],
+            row.P[:keep, :keep],
+            row.structure.free,
+            inputs[: self.delay],
+            row.settled,
+            row.usual,
         ), estimate
 
-    def _estimate(self, z, P, unknown, direct, u, residual, residual_cov, status) -> Estimate:
-        n, nd, _ = (len(names) for names in _names(self.plant))
-        rows = jnp.concatenate([jnp.diag(direct), jnp.diag(~direct)], 1).astype(float)
-        hidden = jnp.where(direct, unknown[n : n + nd], unknown[n + nd :])
-        d = jnp.where(hidden, 0.0, dot(rows, z[n:]))
-        d_cov = _with_unknown(sandwich(rows, P[n:, n:]), hidden)
-        lost = jnp.any(unknown[:n]) | jnp.any(hidden)
-        limits = self.plant.constraints
+    @property
+    def _sizes(self) -> tuple[int, int, int, int]:
+        plant = self.plant
+        return len(plant.states), len(plant.attacks), len(plant.outputs), len(plant.inputs)
+
+    def _row(self, state: UnknownInputState, observation: Observation, at: _Point | None) -> _Row:
+        """The update, a nonlinear plant taken as its tangent about ``at``."""
+        k, u, seen, trusted = state.k + 1, observation.u, observation.seen, observation.trusted
+        n, nd, ny, _ = self._sizes
+        before = (state.z[:n], state.z[n : n + nd]) if at is None else at[:2]
+        m = motion(self.plant, k, before[0], u, before[1])
+        x = dot(m.A, state.z[:n]) + dot(m.G, state.z[n : n + nd]) + m.offset
+        move = _move(m.A, m.G, self.delay)
+        P = sandwich(move, state.P)
+        P = P + jnp.pad(m.Q, (0, P.shape[0] - n))
+        s = sensing(self.plant, k, *((x, u, jnp.zeros(nd)) if at is None else (at.x, u, at.d)))
+        new = jnp.pad(_new_attack(s.H, trusted), ((n, P.shape[0] - n - nd), (0, 0)))
+        free = jnp.concatenate([dot(move, state.free), new], 1)
+        H = jnp.where(trusted[:, None], 0.0, s.H)
+        sense = jnp.pad(jnp.concatenate([s.C, H], 1), ((0, 0), (0, P.shape[0] - n - nd)))
+        whiten = self.plant.whiten if isinstance(self.plant, LinearPlant) else whitener
+        W, W_inverse = whiten(s.R, seen)
+        whole = jnp.all(seen) & ~jnp.any(trusted)
+        structure, settled, usual = _structure(state, whole, W, sense, free)
+        M = dot(W, sense)
+        update = absorb(P, M, free, structure.parts)
+        innovation = jnp.where(seen, observation.y - dot(s.C, x) - s.offset, 0.0)
+        z = jnp.concatenate([x, jnp.zeros(nd), state.z[n:]])
+        z = z + dot(update.gain, dot(W, innovation))
+        blind = dot(W_inverse, update.blind)
+        spread = sandwich(M, P) + jnp.eye(ny)
+        return _Row(
+            z,
+            update.cov,
+            structure,
+            settled,
+            usual,
+            dot(dot(blind, W), innovation),
+            sandwich(blind, spread),
+        )
+
+    def _relinearised(
+        self, state: UnknownInputState, observation: Observation
+    ) -> tuple[_Row, Bool[Array, ""]]:
+        """The row linearised about its own estimates (Gauss-Newton), and whether they moved on."""
+        n, nd, _, _ = self._sizes
+        k, u = state.k + 1, observation.u
+        x, d = state.z[:n], state.z[n : n + nd]
+
+        def again(carry):
+            count, at, _, _ = carry
+            row = self._row(state, observation, at)
+            unknown = row.structure.unknown
+            z = jnp.where(unknown, _about(at, row.z.shape[0]), row.z)
+            after = _Point(at.x_before, z[n + nd : n + 2 * nd], z[:n], z[n : n + nd])
+            step = jnp.abs(z - _about(at, row.z.shape[0]))[: n + 2 * nd]
+            deviation = jnp.sqrt(jnp.maximum(jnp.diagonal(row.P), 0.0))[: n + 2 * nd]
+            return count + 1, after, row, jnp.any(step > SETTLED * deviation + 1e-12)
+
+        at = _Point(x, d, self.plant.transition(k, x, u, d), jnp.zeros(nd))
+        first = again((0, at, None, None))
+        _, _, row, moving = jax.lax.while_loop(
+            lambda carry: carry[3] & (carry[0] < PASSES), again, first
+        )
+        return row, moving
+
+    def _estimate(self, row: _Row, k, u, status) -> Estimate:
+        """The record of a row; ``u`` is the input of row k - L, over which its attack acted."""
+        n, nd, _, _ = self._sizes
+        z, P, unknown = row.z, row.P, row.structure.unknown
+        direct = self.direct if self.direct.ndim == 1 else self.direct[k - 1]
+        newer = n + nd * self.delay
+        pick = jnp.concatenate([jnp.diag(direct), jnp.diag(~direct)], 1).astype(float)
+        hidden = jnp.where(direct, unknown[newer : newer + nd], unknown[newer + nd :])
+        d = jnp.where(hidden, 0.0, dot(pick, z[newer:]))
+        d_cov = _with_unknown(sandwich(pick, P[newer:, newer:]), hidden)
+        # with a delay the state is meant to await later data
+        lost = jnp.any(hidden) | (jnp.any(unknown[:n]) if self.delay == 0 else False)
+        d_rows, d_bound = limits_of(self.plant).attack.at(k - self.delay, u)
         return Estimate(
             x=z[:n],
             x_cov=_with_unknown(P[:n, :n], unknown[:n]),
@@ -151,10 +250,10 @@ class UnknownInput(Estimator):
             d_cov=d_cov,
             d_free=d,
             d_free_cov=d_cov,
-            d_rows=limits.attack,
-            d_bound=limits.attack_bound + dot(limits.attack_bound_u, u),
-            residual=residual,
-            residual_cov=residual_cov,
+            d_rows=d_rows,
+            d_bound=d_bound,
+            residual=row.residual,
+            residual_cov=row.residual_cov,
             status=status | jnp.where(lost, int(Status.UNOBSERVABLE), 0).astype(jnp.int32),
         )
 
@@ -170,57 +269,65 @@ def find_structure(W, sense, free, keep: int) -> Structure:
 def _structure(
     state: UnknownInputState, whole: Bool[Array, ""], W, sense, free
 ) -> tuple[Structure, Bool[Array, ""], Structure | None]:
-    """The structure of this row, and the usual one with whether it is known by now."""
-    keep = state.free.shape[0]
-    usual = state.usual
+    """The structure of this row, whether it maps ``state.free`` onto itself, and the usual one."""
+    keep, usual = state.free.shape[0], state.usual
     if usual is None:
-        return find_structure(W, sense, free, keep), state.known, None
-    again = state.plain & whole
+        return find_structure(W, sense, free, keep), state.settled, None
 
     def anew():
         found = find_structure(W, sense, free, keep)
-        kept = jax.tree.map(lambda new, old: jnp.where(again, new, old), found, usual)
-        return found, state.known | again, kept
+        same = whole & jnp.all(found.free == state.free)
+        kept = jax.tree.map(lambda new, old: jnp.where(same, new, old), found, usual)
+        return found, same, kept
 
-    return jax.lax.cond(again & state.known, lambda: (usual, state.known, usual), anew)
+    return jax.lax.cond(whole & state.settled, lambda: (usual, state.settled, usual), anew)
 
 
-def build(plant: LinearPlant, x0, P0) -> UnknownInput:
-    """The estimator for a linear plant, from the estimate ``x0``, ``P0`` before the first row."""
+def build(plant: Plant, x0, P0, *, delay: int = 0) -> UnknownInput:
+    """The estimator from the estimate ``x0``, ``P0`` before the first row.
+
+    ``delay``: steps to wait for an attack; `holdfast analyse` says how many each one needs.
+    Raises `InvalidValue` where it is negative.
+    """
+    if delay < 0:
+        raise InvalidValue("delay", delay, "a number of steps, 0 or more")
     x0, P0 = jnp.asarray(x0, float), jnp.asarray(P0, float)
-    direct, hidden = _over_time(plant, _direct), _over_time(plant, _hidden)
-    return UnknownInput(plant, x0, P0, jnp.asarray(direct), jnp.asarray(hidden))
+    direct, hidden = (
+        jnp.asarray(f(plant, np.asarray(x0))) for f in (direct_channels, hidden_input)
+    )
+    return UnknownInput(plant, x0, P0, direct, hidden, delay)
 
 
-def _names(plant: LinearPlant) -> tuple[tuple[str, ...], ...]:
-    return plant.states, plant.attacks, plant.outputs
-
-
-def _move(m: Matrices) -> Float[Array, "w s"]:
-    """(x, d) -> (A x + G d, 0, d): the attack at k-1 is kept beside the one at k."""
-    n, nd = m.G.shape
+def _move(A, G, delay: int) -> Float[Array, "w s"]:
+    """(x, d, older d) -> (A x + G d, 0, d, older d): past attacks are kept beside the new one."""
+    n, nd = G.shape
+    past = nd * (delay + 1)
     return jnp.concatenate(
         [
-            jnp.concatenate([m.A, m.G], 1),
-            jnp.zeros((nd, n + nd)),
-            jnp.concatenate([jnp.zeros((nd, n)), jnp.eye(nd)], 1),
+            jnp.pad(jnp.concatenate([A, G], 1), ((0, nd), (0, past - nd))),
+            jnp.pad(jnp.eye(past), ((0, 0), (n, 0))),
         ]
     )
 
 
-def _new_attack(H, trusted, n: int) -> Float[Array, "w nd"]:
-    """The free directions of d_k among (x_k, d_k, d_{k-1}): all, less what is authenticated.
+def _new_attack(H, trusted) -> Float[Array, "nd nd"]:
+    """The free directions of d_k: all, less what is authenticated.
 
     A trusted output cannot have been attacked, so H d = 0 there, exactly.
     """
     nd = H.shape[1]
     rows = jnp.where(trusted[:, None], H, 0.0)
-    free = jax.lax.cond(
+    return jax.lax.cond(
         jnp.any(trusted),
         lambda: leftover(jnp.eye(nd), split(rows, jnp.abs(rows))),
         lambda: jnp.eye(nd),
     )
-    return jnp.concatenate([jnp.zeros((n, nd)), free, jnp.zeros((nd, nd))])
+
+
+def _about(at: _Point, size: int) -> Float[Array, " w"]:
+    """The linearisation point in the order of z; nothing is linearised in older attacks."""
+    near = jnp.concatenate([at.x, at.d, at.d_before])
+    return jnp.pad(near, (0, size - near.shape[0]))
 
 
 def _with_unknown(cov: Float[Array, "m m"], unknown: Bool[Array, " m"]) -> Float[Array, "m m"]:
@@ -230,47 +337,5 @@ def _with_unknown(cov: Float[Array, "m m"], unknown: Bool[Array, " m"]) -> Float
     return jnp.where(diagonal, jnp.inf, jnp.where(either, 0.0, cov))
 
 
-def _row(flags: Bool[Array, "*t"], k) -> Bool[Array, ""]:
+def _at_row(flags: Bool[Array, "*t"], k) -> Bool[Array, ""]:
     return flags if flags.ndim == 0 else flags[k - 1]
-
-
-def _over_time(plant: LinearPlant, of: Callable[[Matrices], np.ndarray]) -> np.ndarray:
-    """A structural property of the matrices: per step where they are, on every grid point and
-    so between them where they are scheduled, else once.
-    """
-    sources = {name: getattr(plant, name) for name in Matrices._fields}
-    lengths = [len(v) for v in sources.values() if not isinstance(v, Table) and v.ndim == 3]
-
-    def entry(source, i) -> Any:
-        if isinstance(source, Table):
-            return np.asarray(source.values)[i % len(source.values)]
-        return np.asarray(source if source.ndim == 2 else source[i])
-
-    if lengths:
-        each = range(min(lengths))
-    else:
-        grids = [len(v.values) for v in sources.values() if isinstance(v, Table)]
-        each = range(max(grids, default=1))
-    found = np.stack([of(Matrices(*(entry(v, i) for v in sources.values()))) for i in each])
-    return found if lengths else np.asarray(np.all(found, 0))
-
-
-def _rank(rows: np.ndarray) -> int:
-    """Rank after scaling rows and columns to unit size: units of a channel do not matter."""
-    for axis in (1, 0):
-        norms = np.linalg.norm(rows, axis=axis, keepdims=True)
-        rows = np.divide(rows, norms, out=np.zeros_like(rows), where=norms > 0)
-    return int(np.linalg.matrix_rank(rows, tol=RANK_TOLERANCE)) if rows.size else 0
-
-
-def _direct(m: Matrices) -> np.ndarray:
-    """Which channels' axes lie in the row space of H."""
-    H = np.asarray(m.H)
-    axes = np.eye(H.shape[1])
-    return np.array([_rank(np.vstack([H, axis])) == _rank(H) for axis in axes], bool)
-
-
-def _hidden(m: Matrices) -> np.ndarray:
-    """Whether an attack moves the state and reaches no output of its own row or the next."""
-    felt = np.vstack([m.H, m.C @ m.G])
-    return np.array(_rank(np.vstack([felt, m.G])) > _rank(felt))

@@ -64,7 +64,7 @@ def symmetric(p: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 def repeat(count: int, body: Callable[[Any, Any], Any], carry: Any) -> Any:
     """Carry <- body(i, carry) for i = 0 .. count-1."""
-    return jax.lax.fori_loop(0, count, body, carry)
+    return jax.lax.fori_loop(0, count, body, carry) if count else carry
 
 
 def lower_factor(p: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, " n"]]:

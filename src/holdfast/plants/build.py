@@ -11,7 +11,8 @@ from scipy.linalg import solve_triangular
 
 from holdfast.numerics.sampling import sample
 from holdfast.parts import InvalidValue
-from holdfast.plants.linear import Constraints, LinearPlant, Sampling, Table
+from holdfast.plants.constraints import constraints as checked_constraints
+from holdfast.plants.linear import LinearPlant, Sampling, Table
 
 ROUNDING = 1e-8
 """Relative asymmetry and indefiniteness of a covariance put down to rounding: files hold
@@ -69,7 +70,8 @@ def linear_plant(
         sampling = None
     else:
         found, sampling = _discretised(found, dt, method, noise)
-    limits = _constraints(constraints or {}, *(len(names[k]) for k in names if k != "outputs"))
+    sizes = (len(names[k]) for k in ("states", "inputs", "attacks"))
+    limits = checked_constraints(constraints or {}, *sizes)
     arrays: dict[str, Any] = {key: _mapped(jnp.asarray, value) for key, value in found.items()}
     R_found: Any = found["R"]
     constant_R = isinstance(R_found, np.ndarray) and R_found.ndim == 2
@@ -245,26 +247,3 @@ def _discretised(
     run = jax.jit(jax.vmap(one, in_axes=axes) if over_time else one)
     discrete = run(*(jnp.asarray(found[key]) for key in keys))
     return {**found, **dict(zip(keys, map(np.asarray, discrete), strict=True))}, None
-
-
-def _constraints(sets: dict[str, dict[str, Any]], n: int, nu: int, nd: int) -> Constraints:
-    for key in sets:
-        _choice("constraints", key, ("state", "attack"))
-    parts = []
-    for key, columns in (("state", n), ("attack", nd)):
-        given = sets.get(key, {"matrix": np.zeros((0, columns)), "bound": []})
-        where = f"constraints.{key}"
-        rows = _matrix(f"{where}.matrix", given["matrix"])
-        assert isinstance(rows, np.ndarray)
-        bound = np.asarray(given["bound"], float)
-        bound_u = given.get("bound_u")
-        by_u = np.zeros((len(rows), nu)) if bound_u is None else np.asarray(bound_u, float)
-        for name, array, shape in (
-            ("matrix", rows, (len(rows), columns)),
-            ("bound", bound, (len(rows),)),
-            ("bound_u", by_u, (len(rows), nu)),
-        ):
-            if array.shape != shape:
-                raise InvalidValue(f"{where}.{name}", array.shape, f"shape {shape}")
-        parts += [jnp.asarray(rows), jnp.asarray(bound), jnp.asarray(by_u)]
-    return Constraints(*parts)

@@ -15,6 +15,7 @@ from holdfast.numerics.blue import whitener
 from holdfast.numerics.linalg import dot
 from holdfast.numerics.sampling import sample
 from holdfast.parts import Plant
+from holdfast.plants.constraints import Constraints
 
 
 class Table(eqx.Module):
@@ -49,17 +50,6 @@ class Matrices(NamedTuple):
     H: Float[Array, "ny nd"]
     Q: Float[Array, "n n"]
     R: Float[Array, "ny ny"]
-
-
-class Constraints(eqx.Module):
-    """What physics allows: ``matrix z <= bound + bound_u u`` for the state and the attack."""
-
-    state: Float[Array, "m n"]
-    state_bound: Float[Array, " m"]
-    state_bound_u: Float[Array, "m nu"]
-    attack: Float[Array, "l nd"]
-    attack_bound: Float[Array, " l"]
-    attack_bound_u: Float[Array, "l nu"]
 
 
 class Sampling(NamedTuple):
@@ -102,9 +92,9 @@ class LinearPlant(Plant):
 
     @property
     def steps(self) -> int | None:
-        """How many steps the per-step matrices cover; None if there are none."""
+        """How many steps the per-step matrices and limits cover; None if there are none."""
         lengths = [m.shape[0] for m in self._sources if not isinstance(m, Table) and m.ndim == 3]
-        return min(lengths, default=None)
+        return min(lengths + self.constraints.lengths, default=None)
 
     @property
     def _sources(self) -> tuple[Matrix, ...]:

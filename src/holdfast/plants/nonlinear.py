@@ -10,6 +10,8 @@ from jaxtyping import Array, Float
 
 from holdfast.parts import InvalidValue, Plant
 from holdfast.plants.build import covariance
+from holdfast.plants.constraints import Constraints
+from holdfast.plants.constraints import constraints as checked_constraints
 
 Function = Callable[[Any, Any, Any], Any]
 
@@ -23,6 +25,7 @@ class NonlinearPlant(Plant):
 
     Q: Float[Array, "n n"]
     R: Float[Array, "ny ny"]
+    constraints: Constraints
     f: Function = eqx.field(static=True)
     h: Function = eqx.field(static=True)
     dt: float = eqx.field(static=True)
@@ -30,6 +33,11 @@ class NonlinearPlant(Plant):
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
     attacks: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def steps(self) -> int | None:
+        """How many steps limits that move in time cover; None if none does."""
+        return min(self.constraints.lengths, default=None)
 
     def transition(self, k, x, u, d) -> Float[Array, " n"]:
         """f(x, u, d)."""
@@ -55,8 +63,11 @@ def nonlinear_plant(
     outputs: Sequence[str],
     inputs: Sequence[str] = (),
     attacks: Sequence[str] = (),
+    constraints: dict[str, dict[str, Any]] | None = None,
 ) -> NonlinearPlant:
     """A nonlinear plant; f and h are traced once, so that a wrong shape is told here.
+
+    ``constraints``: {"state" | "attack": {"matrix", "bound", "bound_u"}}.
 
     Raises `InvalidValue` naming the function or matrix, what was found and expected.
     """
@@ -76,6 +87,7 @@ def nonlinear_plant(
     return NonlinearPlant(
         Q=jnp.asarray(Q),
         R=jnp.asarray(R),
+        constraints=checked_constraints(constraints or {}, len(states), len(inputs), len(attacks)),
         f=f,
         h=h,
         dt=float(dt),
