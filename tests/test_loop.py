@@ -130,3 +130,25 @@ def test_200_plants_are_one_compilation():
         u, y, seen = systems.random_log(seed, system.plant, 5)
         run(monitor_of(system, kalman.build, "residual"), Observation.of(u, y, seen))
     assert count == 1
+
+
+def test_the_simulated_truth_stops_at_the_limits():
+    """A cart pushed against a wall, by a push beyond what the drive can give."""
+    plant = linear_plant(
+        A=[[1, 0.1], [0, 1]], B=[[0], [0.1]], C=np.eye(2), G=[[0], [0.1]], Q=1e-4 * np.eye(2),
+        R=1e-2 * np.eye(2), dt=0.1,
+        constraints={
+            "state": {"matrix": [[1, 0]], "bound": [1.0]},
+            "attack": {"matrix": [[1]], "bound": [2.0], "bound_u": [[-1]]},
+        },
+    )  # fmt: skip
+    estimator = unknown_input.build(plant, [0, 0], 0.01 * np.eye(2))
+    monitor = Monitor(estimator, chi_square.build(plant, on="attack"))
+    push = bias.build(plant, channel="channel:d1", value=5.0, start=0.5)
+    scenario = Scenario(plant, jnp.zeros(2), monitor, attacks=(push,))
+    trace = simulate(scenario, jax.random.key(0), 60)
+    assert np.all(np.asarray(trace.x)[:, 0] <= 1.0 + 1e-12)
+    assert np.asarray(trace.x)[-1, 0] == pytest.approx(1.0, abs=1e-12)
+    injected = np.asarray(trace.injection.d)[:, 0]
+    np.testing.assert_allclose(injected[6:], 2.0, rtol=1e-12)
+    assert np.all(injected[:3] == 0.0)

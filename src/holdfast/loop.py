@@ -101,7 +101,7 @@ def replay(monitor: Monitor, observations: Observation) -> Trace:
 
     start = (monitor.init(), jnp.zeros(observations.u.shape[-1]))
     _, rows = jax.lax.scan(row, start, observations)
-    return Trace(*rows)
+    return Trace(*rows, delay=_delay(monitor))
 
 
 @eqx.filter_jit
@@ -110,7 +110,8 @@ def simulate(scenario: Scenario, key: PRNGKeyArray, steps: int) -> Trace:
 
     At row k: the plant moves under u_k with the attack injected at k-1, the attacker sees the
     clean sample of k and injects into it, the monitor sees the result. ``Trace.injection`` of
-    row k is what was injected at k, ``Trace.x`` the true state at k.
+    row k is what was injected at k, ``Trace.x`` the true state at k. Where the plant has
+    limits the state stops at them, and an attack that asks for more than they allow saturates.
     """
     plant, monitor = scenario.plant, scenario.monitor
     attack_key, run_key = jax.random.split(key)
@@ -128,11 +129,13 @@ def simulate(scenario: Scenario, key: PRNGKeyArray, steps: int) -> Trace:
     estimator_state, estimate = monitor.estimator.init()
     state = (estimator_state, monitor.detector.init())
 
+    def command(estimate):
+        return zero_u if scenario.controller is None else scenario.controller.command(estimate)
+
     def row(carry, inputs):
-        x, state, attack_states, injected, estimate = carry
+        x, state, attack_states, injected, u = carry
         k, key = inputs
         move_key, measure_key = jax.random.split(key)
-        u = zero_u if scenario.controller is None else scenario.controller.command(estimate)
         x = plant.advance(move_key, k, x, u + injected.u, injected.d)
         clean = plant.measure(measure_key, k, x, u, zero_d)
         attack_states, injected = _inject(
@@ -142,13 +145,25 @@ def simulate(scenario: Scenario, key: PRNGKeyArray, steps: int) -> Trace:
         everything = jnp.ones(y.shape, bool)
         observation = Observation(u, y, everything, ~everything, jnp.asarray(0, jnp.int32))
         state, (estimate, verdict) = monitor_step(monitor, state, observation)
-        return (x, state, attack_states, injected, estimate), (
-            Trace(observation, estimate, verdict, x, injected)
-        )
+        u = command(estimate)
+        injected = _saturated(plant, k + 1, u, injected)
+        rows = Trace(observation, estimate, verdict, x, injected, _delay(monitor))
+        return (x, state, attack_states, injected, u), rows
 
-    carry = (scenario.x0, state, attack_states, injected, estimate)
+    u = command(estimate)
+    carry = (scenario.x0, state, attack_states, _saturated(plant, 1, u, injected), u)
     inputs = (jnp.arange(1, steps + 1, dtype=jnp.int32), jax.random.split(run_key, steps))
     return jax.lax.scan(row, carry, inputs)[1]
+
+
+def _saturated(plant: Plant, k, u, injected: Injection) -> Injection:
+    """What of an injection the limits of the plant let through over the interval up to k."""
+    return eqx.tree_at(lambda i: i.d, injected, plant.saturated(k, u, injected.d))
+
+
+def _delay(monitor: Monitor) -> int:
+    """Rows by which the attack estimate lags; only estimators that can wait have the setting."""
+    return getattr(monitor.estimator, "delay", 0)
 
 
 def _inject(

@@ -48,11 +48,18 @@ class Plant(eqx.Module):
         """The covariances of process and measurement noise at k."""
 
     def advance(self, key: PRNGKeyArray, k, x, u, d) -> Float[Array, " n"]:
-        """The state at k, process noise included."""
+        """The state at k, process noise included; it stops at the limits of physics."""
         Q, _ = self.noise(k, x, u)
-        return self.transition(k, x, u, d) + dot(
-            psd_factor(Q), jax.random.normal(key, (len(self.states),))
-        )
+        noise = dot(psd_factor(Q), jax.random.normal(key, (len(self.states),)))
+        return self.confined(k, u, self.transition(k, x, u, d) + noise)
+
+    def confined(self, k, u, x) -> Float[Array, " n"]:
+        """The state that is possible at k and nearest to x; any is where there are no limits."""
+        return x
+
+    def saturated(self, k, u, d) -> Float[Array, " nd"]:
+        """The attack over the interval that ends at k that is possible and nearest to d."""
+        return d
 
     def measure(self, key: PRNGKeyArray, k, x, u, d) -> Float[Array, " ny"]:
         """The measurement at k, noise included."""

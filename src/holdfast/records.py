@@ -208,10 +208,14 @@ class Injection(eqx.Module):
 
 
 class Trace(eqx.Module):
-    """A whole run, time along the leading axis; ``x`` and ``injection`` only if simulated."""
+    """A whole run, time along the leading axis; ``x`` and ``injection`` only if simulated.
+
+    ``delay``: rows by which the attack estimate lags what it would otherwise be of.
+    """
 
     observation: Observation
     estimate: Estimate
     verdict: Verdict
     x: Float[Array, "*t n"] | None = None
     injection: Injection | None = None
+    delay: int = eqx.field(static=True, default=0)

@@ -29,16 +29,6 @@ STIFFNESS = 1e-8
 limits contradict each other the fallback "nearest" shares the violation among them."""
 
 
-class _Held(NamedTuple):
-    """An estimate under its limits: where it is held, and by which rows how strongly."""
-
-    value: Float[Array, " m"]
-    cov: Float[Array, "m m"]
-    active: Bool[Array, " r"]
-    multipliers: Float[Array, " r"]
-    feasible: Bool[Array, ""]
-
-
 class Care(Estimator):
     """min (z - z^u)' P^{-1} (z - z^u)  subject to  rows z <= bound,  for z = x_k and z = d.
 
@@ -50,8 +40,8 @@ class Care(Estimator):
                 n - (active rows).
     "output"    the same projection of what is given out; the filter runs on without it.
     "moments"   mean and covariance of the Gaussian N(z^u, P) restricted to the set
-                (`holdfast.numerics.truncated`), which are right for a truth that is drawn so;
-                the filter runs on without them.
+                (`holdfast.numerics.truncated`), state and attack jointly, which are right for a
+                truth that is drawn so; the filter runs on without them.
 
     Limits of what the data leave undetermined at a row do not act there. Where no point of a
     set is left the row is INFEASIBLE and gives the estimate without that set; with
@@ -61,7 +51,7 @@ class Care(Estimator):
     """
 
     free: UnknownInput
-    slabs: tuple[Slabs, ...] = eqx.field(static=True)
+    slabs: Slabs = eqx.field(static=True)
     project: str = eqx.field(static=True)
     nearest: bool = eqx.field(static=True)
 
@@ -83,40 +73,92 @@ class Care(Estimator):
         self, state: UnknownInputState, observation: Observation
     ) -> tuple[UnknownInputState, Estimate]:
         """One row without limits, then the limits on what it says."""
-        state, found = self.free.step(state, observation)
+        state, free, cross = self.free.jointly(state, observation)
         rows, bound = limits_of(self.plant).state.at(state.k, observation.u)
-        x = self._hold(found.x, found.x_cov, rows, bound, 0)
-        d = self._hold(found.d, found.d_cov, found.d_rows, found.d_bound, 1)
-        x_cov = x.cov
+        x = _hold(_Limited.of(free.x, free.x_cov, rows, bound), self.nearest)
+        d = _hold(_Limited.of(free.d, free.d_cov, free.d_rows, free.d_bound), self.nearest)
         if self.project == "feedback":
             state = _carried(state, x, rows)
-            n = x_cov.shape[0]
-            x_cov = jnp.where(jnp.isfinite(x_cov), state.P[:n, :n], x_cov)
         empty = jnp.where(x.feasible & d.feasible, 0, int(Status.INFEASIBLE)).astype(jnp.int32)
+        held = (x.value, x.cov, d.value, d.cov)
+        if self.project == "moments":
+            held = _restricted(x, d, cross, self.slabs)
         return state, eqx.tree_at(
-            lambda e: (e.x, e.x_cov, e.d, e.d_cov, e.status),
-            found,
-            (x.value, x_cov, d.value, d.cov, found.status | empty),
+            lambda e: (e.x, e.x_cov, e.d, e.d_cov, e.status), free, (*held, free.status | empty)
         )
 
-    def _hold(self, value, cov, rows, bound, which: int) -> _Held:
-        """``value`` under its limits; its entries of infinite variance are left alone."""
+
+class _Limited(NamedTuple):
+    """An estimate and the limits that act on it: none on what is of infinite variance."""
+
+    value: Float[Array, " m"]
+    cov: Float[Array, "m m"]
+    rows: Float[Array, "r m"]
+    bound: Float[Array, " r"]
+    unknown: Bool[Array, " m"]
+
+    @classmethod
+    def of(cls, value, cov, rows, bound) -> "_Limited":
+        """The covariance without its infinite entries, the limits without those they touch."""
         unknown = ~jnp.isfinite(jnp.diagonal(cov))
         known = jnp.where(unknown[:, None] | unknown[None, :], 0.0, cov)
         touched = jnp.any((rows != 0) & unknown, 1)
-        bound = jnp.where(touched, jnp.inf, bound)
-        found = project(value, known, rows, bound)
-        ok = found.feasible
-        if self.project == "moments":
-            inside = restricted(value, known, rows, bound, self.slabs[which])
-            point, spread = inside.mean, inside.cov
-        else:
-            point, spread = found.point, on_faces(known, rows, found.active)
-        instead = _least_violation(value, known, rows, bound) if self.nearest else value
-        point = jnp.where(ok & ~unknown, point, jnp.where(unknown, value, instead))
-        spread = jnp.where(ok, spread, known)
-        spread = jnp.where(unknown[:, None] & jnp.eye(len(value), dtype=bool), jnp.inf, spread)
-        return _Held(point, spread, found.active, found.multipliers, ok)
+        return cls(value, known, rows, jnp.where(touched, jnp.inf, bound), unknown)
+
+    def told(self, cov: Float[Array, "m m"]) -> Float[Array, "m m"]:
+        """``cov`` with the infinite variances back in place."""
+        place = self.unknown[:, None] & jnp.eye(len(self.unknown), dtype=bool)
+        return jnp.where(place, jnp.inf, cov)
+
+
+class _Held(NamedTuple):
+    """An estimate under its limits: where it is held, and by which rows how strongly."""
+
+    value: Float[Array, " m"]
+    cov: Float[Array, "m m"]
+    active: Bool[Array, " r"]
+    multipliers: Float[Array, " r"]
+    feasible: Bool[Array, ""]
+    free: _Limited
+
+
+def _hold(free: _Limited, nearest: bool) -> _Held:
+    """The estimate projected onto its limits; where they contradict each other, as it was."""
+    found = project(free.value, free.cov, free.rows, free.bound)
+    ok = found.feasible
+    instead = _least_violation(free) if nearest else free.value
+    value = jnp.where(free.unknown, free.value, jnp.where(ok, found.point, instead))
+    cov = free.told(on_faces(free.cov, free.rows, found.active))
+    return _Held(value, cov, found.active, found.multipliers, ok, free)
+
+
+def _restricted(x: _Held, d: _Held, cross, slabs: Slabs):
+    """Mean and covariance of x and of d, jointly Gaussian, inside the limits of both.
+
+    The limits of an attack tell about the state that it moved, and the other way round.
+    """
+    n = len(x.value)
+    sides = (x.free, d.free)
+    cov = jnp.block([[x.free.cov, cross], [cross.T, d.free.cov]])
+    rows = _side_by_side(x.free.rows, d.free.rows)
+    bound = jnp.concatenate([jnp.where(s.feasible, s.free.bound, jnp.inf) for s in (x, d)])
+    start = jnp.concatenate([side.value for side in sides])
+    found = restricted(start, cov, rows, bound, slabs)
+    mean = jnp.where(jnp.concatenate([side.unknown for side in sides]), start, found.mean)
+    given = (mean[:n], found.cov[:n, :n], mean[n:], found.cov[n:, n:])
+    x_mean = jnp.where(x.feasible, given[0], x.value)
+    d_mean = jnp.where(d.feasible, given[2], d.value)
+    return x_mean, x.free.told(given[1]), d_mean, d.free.told(given[3])
+
+
+def _side_by_side(first: Float[Array, "a n"], second: Float[Array, "b m"]):
+    """The rows of both, each on its own columns."""
+    return jnp.concatenate(
+        [
+            jnp.pad(first, ((0, 0), (0, second.shape[1]))),
+            jnp.pad(second, ((0, 0), (first.shape[1], 0))),
+        ]
+    )
 
 
 def on_faces(
@@ -154,18 +196,17 @@ def _carried(state: UnknownInputState, x: _Held, rows) -> UnknownInputState:
     return eqx.tree_at(lambda s: (s.z, s.P), state, (z, on_faces(state.P, wide, x.active)))
 
 
-def _least_violation(value, cov, rows, bound):
+def _least_violation(free: _Limited):
     """The point whose squared violations of the limits, in its standard deviations, are least.
 
     The projection of (value, 0) with a stiff slack for each row: rows z - slack <= bound.
     """
-    m = rows.shape[0]
-    variance = jnp.sum(dot(rows, cov) * rows, 1)
+    m, n = free.rows.shape
+    variance = jnp.sum(dot(free.rows, free.cov) * free.rows, 1)
     slack = STIFFNESS * jnp.where(variance > 0, variance, 1.0)
-    wide = jnp.concatenate([rows, -jnp.eye(m)], 1)
-    both = jnp.pad(cov, (0, m)) + jnp.diag(jnp.concatenate([jnp.zeros(len(value)), slack]))
-    found = project(jnp.pad(value, (0, m)), both, wide, bound)
-    return found.point[: len(value)]
+    wide = jnp.concatenate([free.rows, -jnp.eye(m)], 1)
+    both = jnp.pad(free.cov, (0, m)) + jnp.diag(jnp.concatenate([jnp.zeros(n), slack]))
+    return project(jnp.pad(free.value, (0, m)), both, wide, free.bound).point[:n]
 
 
 def build(
@@ -190,14 +231,13 @@ def build(
         if value not in allowed:
             raise InvalidValue(key, repr(value), " or ".join(map(repr, allowed)))
     limits = limits_of(plant)
-    slabs = ()
+    slabs = find_slabs(np.zeros((0, 0)))
     if project == "moments":
         sides = (limits.state.matrix, limits.attack.matrix)
         if any(side.ndim > 2 for side in sides):
-            raise InvalidValue(
-                "project", "'moments'", "constant rows of the constraints (their bounds may move)"
-            )
-        slabs = (find_slabs(np.asarray(sides[0])), find_slabs(np.asarray(sides[1])))
+            expected = "constant rows of the constraints (their bounds may move)"
+            raise InvalidValue("project", "'moments'", expected)
+        slabs = find_slabs(np.asarray(_side_by_side(*sides)))
     free = build_unknown_input(plant, x0, P0, delay=delay)
     # the abstract field `plant` is a property here, which pyright takes for one more argument
     return Care(free, slabs, project, fallback == "nearest")  # pyright: ignore[reportCallIssue]

@@ -138,12 +138,19 @@ class UnknownInput(Estimator):
             jnp.zeros((ny, ny)),
         )
         nothing = jnp.zeros(nu), jnp.asarray(int(Status.OK), jnp.int32)
-        return state, self._estimate(row, jnp.asarray(1, jnp.int32), *nothing)
+        return state, self._estimate(row, jnp.asarray(1, jnp.int32), *nothing)[0]
 
     def step(
         self, state: UnknownInputState, observation: Observation
     ) -> tuple[UnknownInputState, Estimate]:
         """One row: predict z, determine what can be, correct the rest."""
+        state, estimate, _ = self.jointly(state, observation)
+        return state, estimate
+
+    def jointly(
+        self, state: UnknownInputState, observation: Observation
+    ) -> tuple[UnknownInputState, Estimate, Float[Array, "n nd"]]:
+        """`step`, and the covariance of the errors of x and d (0 where either is undetermined)."""
         k, status = state.k + 1, observation.status
         if isinstance(self.plant, LinearPlant):
             row = self._row(state, observation, None)
@@ -152,9 +159,9 @@ class UnknownInput(Estimator):
             status = status | jnp.where(moving, int(Status.NOT_CONVERGED), 0)
         hidden = jnp.where(_at_row(self.hidden, k), int(Status.HIDDEN_INPUT), 0)
         inputs = jnp.concatenate([observation.u[None], state.inputs])
-        estimate = self._estimate(row, k, inputs[-1], (status | hidden).astype(jnp.int32))
+        found = self._estimate(row, k, inputs[-1], (status | hidden).astype(jnp.int32))
         keep = state.z.shape[0]
-        return UnknownInputState(
+        state = UnknownInputState(
             k,
             row.z[:keep],
             row.P[:keep, :keep],
@@ -162,7 +169,8 @@ class UnknownInput(Estimator):
             inputs[: self.delay],
             row.settled,
             row.usual,
-        ), estimate
+        )
+        return state, *found
 
     @property
     def _sizes(self) -> tuple[int, int, int, int]:
@@ -230,8 +238,11 @@ class UnknownInput(Estimator):
         )
         return row, moving
 
-    def _estimate(self, row: _Row, k, u, status) -> Estimate:
-        """The record of a row; ``u`` is the input of row k - L, over which its attack acted."""
+    def _estimate(self, row: _Row, k, u, status) -> tuple[Estimate, Float[Array, "n nd"]]:
+        """The record of a row, and the covariance of x and d.
+
+        ``u`` is the input of row k - L, over which its attack acted.
+        """
         n, nd, _, _ = self._sizes
         z, P, unknown = row.z, row.P, row.structure.unknown
         direct = self.direct if self.direct.ndim == 1 else self.direct[k - 1]
@@ -243,7 +254,9 @@ class UnknownInput(Estimator):
         # with a delay the state is meant to await later data
         lost = jnp.any(hidden) | (jnp.any(unknown[:n]) if self.delay == 0 else False)
         d_rows, d_bound = limits_of(self.plant).attack.at(k - self.delay, u)
-        return Estimate(
+        cross = dot(P[:n, newer:], pick.T)
+        cross = jnp.where(unknown[:n, None] | hidden[None, :], 0.0, cross)
+        estimate = Estimate(
             x=z[:n],
             x_cov=_with_unknown(P[:n, :n], unknown[:n]),
             d=d,
@@ -256,6 +269,7 @@ class UnknownInput(Estimator):
             residual_cov=row.residual_cov,
             status=status | jnp.where(lost, int(Status.UNOBSERVABLE), 0).astype(jnp.int32),
         )
+        return estimate, cross
 
 
 def find_structure(W, sense, free, keep: int) -> Structure:

@@ -22,15 +22,15 @@ from jaxtyping import Array, Float
 
 from holdfast.numerics.linalg import dot
 
-DEPTH = 32.0
-NODES = 32
-"""Per smooth piece. A whole Gaussian cut where its density is e^-32 of its peak: 3e-13."""
+DEPTH = 36.0
+NODES = 36
+"""Per smooth piece. A whole Gaussian cut where its density is e^-36 of its peak: 1e-14."""
 LINE_DEPTH = 40.0
 LINE_NODES = 40
 """In one dimension, where they cost little: 3e-16."""
-SPACE_DEPTH = 26.0
-SPACE_NODES = 24
-"""In three dimensions, per piece and dimension: 1e-9."""
+SPACE_DEPTH = 30.0
+SPACE_NODES = 28
+"""In three dimensions, per piece and dimension."""
 ZOOMS, GRID = 9, 17
 HALVINGS = 24
 SMALLEST = 1e-8

@@ -10,6 +10,7 @@ expectation propagation (`expectation`), which is an approximation.
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -28,6 +29,9 @@ NARROWEST = 1e-7
 that wide: an equality leaves a variance of 1e-15."""
 FARTHEST = 1e30
 """Bounds beyond as many standard deviations are taken for this far, so that squares exist."""
+
+IDLE = 9.1
+"""Standard deviations beyond which a bound cannot be told from none."""
 
 
 @dataclass(frozen=True)
@@ -107,15 +111,24 @@ def restricted(
     if not slabs.lead:
         return Restricted(mean, cov, jnp.zeros(()))
     normals, low, high = _slabs(mean, cov, rows, bound, slabs)
-    if len(slabs.lead) > 3:
-        return Restricted(*propagate(mean, cov, normals, *_boxed(low, high)))
-    if len(slabs.lead) == 1:
-        u, variance, log_probability = interval(jnp.zeros(()), jnp.ones(()), low[0], high[0])
-        found = BoxMoments(
-            jnp.eye(1), jnp.eye(1), u[None], variance[None, None], log_probability
-        )
+    # outside with probability 1e-19: nothing that a float could show
+    idle = jnp.all((low < -IDLE) & (high > IDLE))
+    unchanged = Restricted(mean, cov, jnp.zeros(()))
+    find = _by_sites if len(slabs.lead) > 3 else _by_quadrature
+    return jax.lax.cond(idle, lambda: unchanged, lambda: find(mean, cov, normals, low, high))
+
+
+def _by_sites(mean, cov, normals, low, high) -> Restricted:
+    return Restricted(*propagate(mean, cov, normals, *_boxed(low, high)))
+
+
+def _by_quadrature(mean, cov, normals, low, high) -> Restricted:
+    if len(low) == 1:
+        one = jnp.ones((1, 1))
+        w, variance, log_probability = interval(jnp.zeros(()), jnp.ones(()), low[0], high[0])
+        found = BoxMoments(one, one, w[None], variance[None, None], log_probability)
     else:
-        box = rectangle if len(slabs.lead) == 2 else cuboid
+        box = rectangle if len(low) == 2 else cuboid
         correlation = symmetric(dot(dot(normals, cov), normals.T))
         found = box(correlation, *_boxed(low, high))
     axes = dot(found.axes, normals)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from holdfast.numerics.linalg import dot
+from holdfast.numerics.projection import project
 from holdfast.parts import InvalidValue, Plant
 
 
@@ -26,6 +27,11 @@ class Polytope(eqx.Module):
         """Rows and bounds at step k, ``u`` being the input of row k."""
         bound = _entry(self.bound, k, 1) + dot(_entry(self.bound_u, k, 2), u)
         return _entry(self.matrix, k, 2), bound
+
+    def nearest(self, k, u, z) -> Float[Array, " n"]:
+        """The point of the set at step k that is nearest to z; z itself where it is empty."""
+        rows, bound = self.at(k, u)
+        return project(z, jnp.eye(rows.shape[1]), rows, bound).point
 
     @property
     def lengths(self) -> list[int]:

@@ -131,6 +131,14 @@ class LinearPlant(Plant):
         m = self.at(k, x, u)
         return dot(m.C, x) + dot(m.D, u) + dot(m.H, d)
 
+    def confined(self, k, u, x) -> Float[Array, " n"]:
+        """The state within its limits and nearest to x."""
+        return self.constraints.state.nearest(k, u, x)
+
+    def saturated(self, k, u, d) -> Float[Array, " nd"]:
+        """The attack within its limits and nearest to d."""
+        return self.constraints.attack.nearest(k, u, d)
+
     def noise(self, k, x, u) -> tuple[Float[Array, "n n"], Float[Array, "ny ny"]]:
         """Q and R."""
         m = self.at(k, x, u)

@@ -47,6 +47,14 @@ class NonlinearPlant(Plant):
         """h(x, u, d)."""
         return self.h(x, u, d)
 
+    def confined(self, k, u, x) -> Float[Array, " n"]:
+        """The state within its limits and nearest to x."""
+        return self.constraints.state.nearest(k, u, x)
+
+    def saturated(self, k, u, d) -> Float[Array, " nd"]:
+        """The attack within its limits and nearest to d."""
+        return self.constraints.attack.nearest(k, u, d)
+
     def noise(self, k, x, u) -> tuple[Float[Array, "n n"], Float[Array, "ny ny"]]:
         """Q and R."""
         return self.Q, self.R

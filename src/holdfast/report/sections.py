@@ -197,10 +197,13 @@ def quality(summary: Mapping[str, Any]) -> Markup:
                Column("One of the two", True)]  # fmt: skip
     lost = any(any(found.values()) for found in summary["data"].values())
     parts = [table(columns, rows) if lost else element("p", "Every sample arrived and was sound.")]
-    total = sum(summary["status"].values())
+    total = summary["rows"] * summary["runs"]
     if summary["status"]["OK"] < total:
-        status = [[name, str(n), _STATUS.get(name, "")] for name, n in summary["status"].items()]
-        columns = [Column("Status"), Column("Rows", True), Column("Meaning")]
+        status = [
+            [name, str(n), f"{n / total:.2%}", _STATUS.get(name, "")]
+            for name, n in summary["status"].items()
+        ]
+        columns = [Column("Status"), Column("Rows", True), Column("Share", True), Column("Meaning")]
         parts += [element("h3", "Status of the estimator"), table(columns, status)]
     return join(parts)
 
@@ -211,7 +214,7 @@ _STATUS = {
     "BAD_INPUT": "a sample was not a finite number and was dropped",
     "UNOBSERVABLE": "an attack channel could not be identified",
     "AMBIGUOUS": "several explanations fit equally well",
-    "INFEASIBLE": "no attack within the constraints explains the data",
+    "INFEASIBLE": "limits contradict each other; the estimate is without them",
     "HIDDEN_INPUT": "an attack reaches the outputs one row later only",
     "NOT_READY": "too few rows so far",
     "NOT_CONVERGED": "an iteration stopped before it had converged",

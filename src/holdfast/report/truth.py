@@ -63,7 +63,11 @@ def true_attack(trace: Trace, plant: Named) -> np.ndarray | None:
     found, at_output = _rows_as_channels(plant, rows, *flat)
     found = np.asarray(found).reshape(*lead, -1)
     before = np.concatenate([np.zeros_like(found[..., :1, :]), found[..., :-1, :]], axis=-2)
-    return np.where(np.asarray(at_output).reshape(found.shape), found, before)
+    truth = np.where(np.asarray(at_output).reshape(found.shape), found, before)
+    if trace.delay == 0:
+        return truth
+    early = np.full_like(truth[..., : trace.delay, :], np.nan)
+    return np.concatenate([early, truth[..., : -trace.delay, :]], axis=-2)
 
 
 @eqx.filter_jit
