@@ -8,16 +8,25 @@ from typing import Any
 
 from holdfast.attacks import bias, delay, freeze, hopping, noise, ramp, replay, sine
 from holdfast.controllers import feedback
-from holdfast.detectors import chi_square, cusum, per_channel, sprt, windowed
+from holdfast.detectors import (
+    care_paper,
+    chi_square,
+    cusum,
+    likelihood_ratio,
+    per_channel,
+    sprt,
+    windowed,
+)
 from holdfast.estimators import care, extended, kalman, unknown_input, unscented
 from holdfast.plants import build
-from holdfast.plants.library import uav
+from holdfast.plants.library import bicycle, uav
 
 Builders = dict[str, Callable[..., Any]]
 
 PLANTS: Builders = {
     "linear": build.linear_plant,
     "uav": uav.build,
+    "bicycle": bicycle.build,
 }
 
 ESTIMATORS: Builders = {
@@ -34,6 +43,8 @@ DETECTORS: Builders = {
     "cusum": cusum.build,
     "sprt": sprt.build,
     "per_channel": per_channel.build,
+    "likelihood_ratio": likelihood_ratio.build,
+    "care_paper": care_paper.build,
 }
 
 ATTACKS: Builders = {

@@ -55,6 +55,8 @@ class Reason(IntEnum):
     RESIDUAL_SEQUENCE = 8
     ATTACK_CHANNEL = 9
     RESIDUAL_CHANNEL = 10
+    IMPOSSIBLE = 11
+    ATTACK_HELD_SUM = 12
 
     @property
     def words(self) -> str:
@@ -74,6 +76,8 @@ _REASON_WORDS = {
     Reason.RESIDUAL_SEQUENCE: "shifted measurements are likelier than sound ones (Wald's test)",
     Reason.ATTACK_CHANNEL: "attack on",
     Reason.RESIDUAL_CHANNEL: "measurement contradicts the model at",
+    Reason.IMPOSSIBLE: "no attack within the limits explains what is measured",
+    Reason.ATTACK_HELD_SUM: "projected attack estimates have added up",
 }
 
 

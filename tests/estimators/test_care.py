@@ -109,7 +109,7 @@ def test_feedback_carries_what_is_correlated_with_the_state():
         active = np.abs(rows @ got.x[0] - bound) < 1e-9
         if not active.any():
             continue
-        A, B, C, D, G, H, Q, R = systems.matrices(plant)
+        A, B, C, _, G, H, Q, R = systems.matrices(plant)
         count = active.sum()
         C_more = np.vstack([C, rows[active]])
         H_more = np.vstack([H, np.zeros((count, 2))])

@@ -22,9 +22,11 @@ from scipy.special import betaincinv
 from holdfast.campaign.attack_free import Judged, attack_free, horizon
 from holdfast.detectors.chi_square import ChiSquare
 from holdfast.detectors.cusum import Cusum
+from holdfast.detectors.likelihood_ratio import LikelihoodRatio
 from holdfast.detectors.per_channel import PerChannel
 from holdfast.detectors.sprt import Sprt
 from holdfast.detectors.windowed import Windowed
+from holdfast.estimators.care import Care
 from holdfast.estimators.kalman import Kalman
 from holdfast.estimators.unknown_input import UnknownInput
 from holdfast.loop import Monitor, replay
@@ -39,7 +41,7 @@ MOST_ROWS = 20_000_000
 BURN_IN = 100
 CANDIDATES = 33
 
-Calibratable = ChiSquare | Windowed | Cusum | Sprt | PerChannel
+Calibratable = ChiSquare | Windowed | Cusum | Sprt | PerChannel | LikelihoodRatio
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Calibration:
     ``burn_in`` of which were left out.
     """
 
-    method: Literal["exact", "simulated", "log", "given"]
+    method: Literal["exact", "bound", "simulated", "log", "given"]
     level: float
     value: float
     sentence: str
@@ -95,6 +97,12 @@ def calibrated(
         origin = "the paper's formula" if detector.rule == "paper" else "a number"
         sentence = f"Threshold from {origin}, not calibrated to a false-alarm rate."
         return monitor, Calibration("given", level, 1.0, sentence)
+    if isinstance(detector, LikelihoodRatio) and detector.test == "possible":
+        sentence = (
+            f"False-alarm rate at most {level:g} per step, whatever attack within the limits "
+            "there is, for Gaussian noise of the covariances stated."
+        )
+        return monitor, Calibration("bound", level, 1.0, sentence)
     if _exact(monitor.estimator, detector):
         sentence = (
             f"False-alarm rate {level:g} per step, exact for Gaussian noise of the "
@@ -126,7 +134,11 @@ def with_value(monitor: Monitor, value: float) -> Monitor:
 
 
 def _exact(estimator: Estimator, detector: Calibratable) -> bool:
+    if isinstance(estimator, Care) and estimator.project != "feedback":
+        estimator = estimator.free  # what is tested is before the projection
     plant = estimator.plant
+    if detector.needs == "simulation" or getattr(detector, "projected", False):
+        return False
     if not (isinstance(estimator, Kalman | UnknownInput) and isinstance(plant, LinearPlant)):
         return False
     if plant.schedule is not None and plant.schedule[0] == "state":

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from holdfast.detectors.settings import checked, chi_square_table, tested, verdict
 from holdfast.numerics.chi_square import SumQuantile, sum_quantile
+from holdfast.numerics.limits import pseudo_distance
 from holdfast.numerics.linalg import mahalanobis
 from holdfast.parts import Detector, InvalidValue, Plant
 from holdfast.records import Estimate, Reason, Verdict
@@ -42,6 +43,9 @@ class Cusum(Detector):
     long run at constant degrees of freedom, three moments at the start and where samples are
     missing. It supposes rows that are independent.
 
+    ``projected``: v is the attack estimate after its projection, S its covariance then; see
+    `holdfast.detectors.care_paper`.
+
     Source: CARE (55), (56).
     """
 
@@ -55,6 +59,7 @@ class Cusum(Detector):
     factor: Float[Array, ""]
     on: str = eqx.field(static=True)
     rule: str = eqx.field(static=True)
+    projected: bool = eqx.field(static=True, default=False)
 
     def init(self) -> CusumState:
         """Nothing summed yet."""
@@ -64,7 +69,11 @@ class Cusum(Detector):
 
     def step(self, state: CusumState, estimate: Estimate) -> tuple[CusumState, Verdict]:
         """The verdict on the sum up to one row."""
-        newest, dof = mahalanobis(*tested(estimate, self.on))
+        if self.projected:
+            held = jnp.asarray(estimate.d), jnp.asarray(estimate.d_cov)
+            newest, dof = pseudo_distance(*held, jnp.asarray(estimate.d_free_cov))
+        else:
+            newest, dof = mahalanobis(*tested(estimate, self.on))
         phi, nu = self.forgetting, dof.astype(float)
         decay = jnp.stack([phi, phi, phi * phi, phi * phi * phi])
         state = CusumState(
@@ -81,7 +90,8 @@ class Cusum(Detector):
             limit = self.quantile.at(*jnp.where(something, state.moments, 1.0))
         statistic = jnp.where(something, state.sum, 0.0)
         threshold = jnp.where(something, self.factor * limit, jnp.inf)
-        codes = Reason.ATTACK_SUM, Reason.RESIDUAL_SUM
+        of_attack = Reason.ATTACK_HELD_SUM if self.projected else Reason.ATTACK_SUM
+        codes = of_attack, Reason.RESIDUAL_SUM
         return state, verdict(statistic, threshold, self.on, codes)
 
 

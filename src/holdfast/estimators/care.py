@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from holdfast.estimators.unknown_input import UnknownInput, UnknownInputState
 from holdfast.estimators.unknown_input import build as build_unknown_input
+from holdfast.numerics.limits import Limited
 from holdfast.numerics.linalg import RANK_TOLERANCE, dot, repeat, symmetric
 from holdfast.numerics.projection import project
 from holdfast.numerics.truncated import Slabs, find_slabs, restricted
@@ -75,8 +76,8 @@ class Care(Estimator):
         """One row without limits, then the limits on what it says."""
         state, free, cross = self.free.jointly(state, observation)
         rows, bound = limits_of(self.plant).state.at(state.k, observation.u)
-        x = _hold(_Limited.of(free.x, free.x_cov, rows, bound), self.nearest)
-        d = _hold(_Limited.of(free.d, free.d_cov, free.d_rows, free.d_bound), self.nearest)
+        x = _hold(Limited.of(free.x, free.x_cov, rows, bound), self.nearest)
+        d = _hold(Limited.of(free.d, free.d_cov, free.d_rows, free.d_bound), self.nearest)
         if self.project == "feedback":
             state = _carried(state, x, rows)
         empty = jnp.where(x.feasible & d.feasible, 0, int(Status.INFEASIBLE)).astype(jnp.int32)
@@ -88,29 +89,6 @@ class Care(Estimator):
         )
 
 
-class _Limited(NamedTuple):
-    """An estimate and the limits that act on it: none on what is of infinite variance."""
-
-    value: Float[Array, " m"]
-    cov: Float[Array, "m m"]
-    rows: Float[Array, "r m"]
-    bound: Float[Array, " r"]
-    unknown: Bool[Array, " m"]
-
-    @classmethod
-    def of(cls, value, cov, rows, bound) -> "_Limited":
-        """The covariance without its infinite entries, the limits without those they touch."""
-        unknown = ~jnp.isfinite(jnp.diagonal(cov))
-        known = jnp.where(unknown[:, None] | unknown[None, :], 0.0, cov)
-        touched = jnp.any((rows != 0) & unknown, 1)
-        return cls(value, known, rows, jnp.where(touched, jnp.inf, bound), unknown)
-
-    def told(self, cov: Float[Array, "m m"]) -> Float[Array, "m m"]:
-        """``cov`` with the infinite variances back in place."""
-        place = self.unknown[:, None] & jnp.eye(len(self.unknown), dtype=bool)
-        return jnp.where(place, jnp.inf, cov)
-
-
 class _Held(NamedTuple):
     """An estimate under its limits: where it is held, and by which rows how strongly."""
 
@@ -119,10 +97,10 @@ class _Held(NamedTuple):
     active: Bool[Array, " r"]
     multipliers: Float[Array, " r"]
     feasible: Bool[Array, ""]
-    free: _Limited
+    free: Limited
 
 
-def _hold(free: _Limited, nearest: bool) -> _Held:
+def _hold(free: Limited, nearest: bool) -> _Held:
     """The estimate projected onto its limits; where they contradict each other, as it was."""
     found = project(free.value, free.cov, free.rows, free.bound)
     ok = found.feasible
@@ -196,7 +174,7 @@ def _carried(state: UnknownInputState, x: _Held, rows) -> UnknownInputState:
     return eqx.tree_at(lambda s: (s.z, s.P), state, (z, on_faces(state.P, wide, x.active)))
 
 
-def _least_violation(free: _Limited):
+def _least_violation(free: Limited):
     """The point whose squared violations of the limits, in its standard deviations, are least.
 
     The projection of (value, 0) with a stiff slack for each row: rows z - slack <= bound.

@@ -28,8 +28,8 @@ NODES = 36
 LINE_DEPTH = 40.0
 LINE_NODES = 40
 """In one dimension, where they cost little: 3e-16."""
-SPACE_DEPTH = 30.0
-SPACE_NODES = 28
+SPACE_DEPTH = 32.0
+SPACE_NODES = 32
 """In three dimensions, per piece and dimension."""
 ZOOMS, GRID = 9, 17
 HALVINGS = 24
@@ -93,9 +93,7 @@ def rectangle(
     return _moments(axes, lift, jnp.stack([t, w]), size, sums[0], sums[1:3], sums[3:])
 
 
-def cuboid(
-    V: Float[Array, "3 3"], low: Float[Array, " 3"], high: Float[Array, " 3"]
-) -> BoxMoments:
+def cuboid(V: Float[Array, "3 3"], low: Float[Array, " 3"], high: Float[Array, " 3"]) -> BoxMoments:
     """Of w ~ N(0, V), unit variances, restricted to low <= w <= high, finite."""
     order = _outer_last(V, high - low)
     V, low, high = dot(dot(order, V), order.T), dot(order, low), dot(order, high)
@@ -191,9 +189,10 @@ def _parallelogram(low, high, half, outer, centre, depth, count) -> Float[Array,
     middle = under + width
     nodes, inner = _rule(count)
     s = middle[:, None] + width[:, None] * nodes
-    exponent = 0.5 * ((peak - outer * outer - t * t)[:, None] - s * s)
+    # at most 0 but for rounding, which is large where the box is 1e8 deviations out
+    exponent = jnp.minimum(0.5 * ((peak - outer * outer - t * t)[:, None] - s * s), 1.0)
     powers = jnp.stack([inner, inner * nodes, inner * nodes * nodes], 1)
-    b0, b1, b2 = ((weights * width) * (jnp.exp(exponent) @ powers).T)
+    b0, b1, b2 = (weights * width) * (jnp.exp(exponent) @ powers).T
     t, w, width = t - t0, cosine * middle + tilt - w0, cosine * width
     c1 = w * b0 + width * b1
     c2 = w * w * b0 + 2.0 * w * width * b1 + width * width * b2

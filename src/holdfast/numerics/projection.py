@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from holdfast.numerics.linalg import lower_factor
+from holdfast.numerics.linalg import lower_factor, repeat
 
 ROUNDING = 1e-12
 """How far a face may be violated, relative to the numbers its violation is the difference
@@ -103,8 +103,9 @@ def project(
     more than `ROUNDING` comes back as it is.
 
     Each face added raises the dual objective, so that no set of active faces comes back and
-    the loop ends by itself; it is cut off after 8 (m + 1) pivots, twice the most that was met
-    in 10^6 random problems of up to 12 faces, and ``residual`` would show it.
+    the loop ends by itself, after 2 m pivots at most in 10^6 random problems. It is cut off at
+    8 (m + 1), which only rounding can make it reach: one problem of those with a covariance
+    of condition 1e11 did, and its ``residual`` was 8e-9 instead of 1e-12 or less.
 
     Source: Goldfarb and Idnani (1983), the dual method; CARE (20), (26).
     """
@@ -114,9 +115,11 @@ def project(
     return Projection(*_project(point, cov, rows, bound))
 
 
-@jax.custom_batching.custom_vmap
-def _project(point, cov, rows, bound):
+def _alone(point, cov, rows, bound):
     return _lanes(point, cov, lower_factor(cov)[0], rows, bound)
+
+
+_project = jax.custom_batching.custom_vmap(_alone)
 
 
 @_project.def_vmap
@@ -256,12 +259,22 @@ def _pivot(faces: _Faces, s: _Working, unfinished: Bool[Array, "*b"]) -> _Workin
 
 
 def _polished(faces: _Faces, found: _Working, active: Bool[Array, "m *b"]):
-    """X and the multipliers, after one step of iterative refinement on the active faces."""
+    """X and the multipliers to full precision, from a dual basis that is good to 1e-3 or so.
+
+    x is put back into the span of the active faces, then onto them; each round of refinement
+    gains as many digits as the dual basis has.
+    """
     table = jnp.where(active[:, None], found.table, 0.0)
-    x = jnp.where(_any(active), found.x, 0.0)
-    missed = jnp.where(active, _dot(faces.normal, x[None]) - faces.distance, 0.0)
-    x = x - _sum(missed[:, None] * table)
-    return x, -_dot(table, x[None])
+    x = _sum(_dot(table, found.x[None])[:, None] * faces.normal)
+
+    def closer(_, x):
+        missed = jnp.where(active, _dot(faces.normal, x[None]) - faces.distance, 0.0)
+        return x - _sum(missed[:, None] * table)
+
+    x = repeat(2, closer, x)
+    weight = -_dot(table, x[None])
+    left = x + _sum(weight[:, None] * faces.normal)
+    return x, weight - _dot(table, left[None])
 
 
 def _residual(faces: _Faces, x, weight, active: Bool[Array, "m *b"]) -> Float[Array, "*b"]:

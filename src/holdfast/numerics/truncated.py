@@ -99,11 +99,15 @@ def restricted(
     nothing; a slab with lo > hi counts as its middle. Everything returned is finite and the
     covariance is positive semidefinite.
 
-    One to three slabs: quadrature, see the tests for the accuracies. One: relative 1e-13 in
-    the offset from the nearer bound and in the variance, hundreds of standard deviations out.
-    Two: 1e-11 at any correlation. Three: see `box_moments`. More, whatever their directions:
-    expectation propagation, see `propagate`. ``log_probability`` is log P(rows z <= bound);
-    that of a set without interior counts it as 1e-7 standard deviations wide.
+    Accuracy, in standard deviations of what is found. One slab: 1e-10 at 800 deviations from
+    the mean, 1e-13 near it. Two: 1e-10 at any correlation. Three: 2e-8 up to a correlation of
+    0.99 for all of them, 1e-6 up to exactly dependent ones (a triangle in the plane). More
+    slabs: expectation propagation, 0.1 at worst; see `propagate`. ``log_probability`` is
+    log P(rows z <= bound), finite also for a set without interior (about -700 for one slab;
+    two or three are counted as `NARROWEST` wide each).
+
+    Cost on one core inside a compiled loop: one slab 1 us, two 40 us, three 0.5 to 1 ms (4 ms
+    a problem under `jax.vmap`, which computes the empty pieces too), six 60 us.
 
     Source: Tallis, J. R. Statist. Soc. B 23 (1961), the regression of z on w; Cunningham,
     Hennig and Lacoste-Julien, arXiv:1111.6832 (2011), expectation propagation.
@@ -151,7 +155,8 @@ def _slabs(mean, cov, rows, bound, slabs: Slabs):
     scale = jnp.where(used, 1.0 / jnp.sqrt(jnp.where(used, variance, 1.0)), 0.0)
     centre = dot(lead, mean)
     length = jnp.sum(lead * lead, 1)
-    low, high = [-jnp.inf] * len(slabs.lead), [jnp.inf] * len(slabs.lead)
+    low = [jnp.asarray(-jnp.inf) for _ in slabs.lead]
+    high = [jnp.asarray(jnp.inf) for _ in slabs.lead]
     for i, slab in enumerate(slabs.of_row):
         if slab < 0:
             continue

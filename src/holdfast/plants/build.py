@@ -171,9 +171,11 @@ def _names(key: str, names: Sequence[str] | None, letter: str, count: int) -> tu
 
 
 def covariance(key: str, m: Any) -> np.ndarray:
-    """A checked covariance (or stack of them): symmetric, not indefinite, R positive definite."""
+    """``m`` (or a stack), exactly symmetric; `InvalidValue` where it is no covariance.
+
+    R must be positive definite, the others only not indefinite.
+    """
     m = np.asarray(m, float)
-    """``m``, exactly symmetric; `InvalidValue` where it is no covariance (R: not definite)."""
     transposed = np.swapaxes(m, -1, -2)
     size = np.max(np.abs(m), initial=0.0)
     if np.max(np.abs(m - transposed), initial=0.0) > ROUNDING * size:

@@ -73,6 +73,40 @@ def run(
 
 
 @app.command()
+def analyse(
+    scenario: ScenarioArgument,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="JSON to standard output, and nothing else.")
+    ] = False,
+    allow_python: AllowPython = False,
+) -> None:
+    """Say what can be said before any data: observability, attacks, sensors to add."""
+    from holdfast.shell import analysing
+
+    analysing.analyse(scenario, as_json, allow_python)
+
+
+@app.command()
+def papers(
+    name: Annotated[
+        str | None,
+        typer.Argument(help="A paper, such as care. Default: all there are.", show_default=False),
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="JSON to standard output, and nothing else.")
+    ] = False,
+    output: Annotated[
+        str | None,
+        typer.Option("-o", help="Folder for papers.json and the figures.", show_default=False),
+    ] = None,
+) -> None:
+    """Run the papers' examples and claims again, and judge them."""
+    from holdfast.shell import judging
+
+    judging.papers(name, as_json, output)
+
+
+@app.command()
 def new(
     kind: Annotated[
         str | None,

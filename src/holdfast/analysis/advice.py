@@ -1,0 +1,164 @@
+"""An analysis in sentences: what is missing, and what would help."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from holdfast.analysis.attacks import Channel
+from holdfast.analysis.whole import Analysis
+from holdfast.analysis.zeros import Zero
+
+SHOWN = 3
+"""Names that a sentence lists."""
+
+
+def advice(found: Analysis, delay: int | None) -> list[str]:
+    """The sentences, most basic first; ``delay`` is the estimator's, None where it has none."""
+    said = [f"This holds for {found.model.note}."] if found.model.note else []
+    said += _on_state(found)
+    for channel in found.attacks.channels:
+        said += _on_channel(channel)
+    said += _on_what_hides(found)
+    said += _on_delay(found, delay)
+    said += _on_bounds(found)
+    said += _on_window(found)
+    return said
+
+
+def _on_state(found: Analysis) -> list[str]:
+    said = []
+    if not found.observability.observable:
+        hidden = [combination(v, found.model.states) for v in found.observability.hidden.T]
+        text = f"The outputs do not determine the state: {_listed(hidden)} reaches none of them"
+        sensors = found.observability.sensors
+        said.append(f"{text}; measure {_either(sensors)} and they do." if sensors else f"{text}.")
+    if found.steady.reason is not None:
+        said.append(f"There is no steady-state Kalman filter: {found.steady.reason}.")
+    return said
+
+
+def _on_channel(channel: Channel) -> list[str]:
+    name, delay = channel.name, channel.delay
+    if delay == 0:
+        return []
+    best = [s.state for s in channel.sensors if s.delay == channel.sensors[0].delay]
+    if delay is None:
+        text, link = f"{name} is never identified: {channel.reason}", ";"
+    else:
+        text = f"{name} reaches the outputs only after {_steps(delay)}: set delay = {delay}"
+        link = ", or"
+    if not best:
+        return [f"{text}."]
+    soonest = channel.sensors[0].delay
+    when = f"after {_steps(soonest)}" if soonest else "at once"
+    return [f"{text}{link} measure {_either(best)} and it is identified {when}."]
+
+
+def _on_what_hides(found: Analysis) -> list[str]:
+    attacks, names = found.attacks, found.model.attacks
+    said = [
+        f"An attack along {combination(v, names)}, followed up by the others, moves no "
+        "output at all, at any size and for ever."
+        for v in attacks.transfer.lost.T
+    ]
+    unstable = [zero for zero in attacks.transfer.zeros if zero.unstable]
+    # a pair of conjugate zeros is one way to hide
+    for zero in (zero for zero in unstable if zero.z.imag >= 0):
+        said += _on_zero(zero, found)
+    if attacks.shields and any(np.any(zero.attack) for zero in unstable):
+        said.append(
+            f"Measure {_either(attacks.shields)} and nothing that lasts can hide like that."
+        )
+    return said
+
+
+def _on_zero(zero: Zero, found: Analysis) -> list[str]:
+    z = f"{zero.z.real:.4g}" if zero.z.imag == 0 else f"{zero.z:.4g}"
+    used = np.max(np.abs(zero.attack), axis=0, initial=0.0) > 0
+    states = [combination(v, found.model.states) for v in zero.state[:, ~used].T]
+    channels = [combination(v, found.model.attacks) for v in zero.attack[:, used].T]
+    said = []
+    if states:
+        said.append(f"Without any attack, {_joined(states, 'or')} can move by the mode {z} unseen.")
+    if channels:
+        said.append(
+            f"An attack on {_joined(channels, 'or')} that goes like ({z})^k hides behind an "
+            "initial state that is not known exactly (invariant zero): it is identified "
+            "without bias, but its error does not fade."
+        )
+    return said
+
+
+def _on_delay(found: Analysis, delay: int | None) -> list[str]:
+    needed = found.attacks.delay
+    if delay is None or delay >= needed:
+        return []
+    return [f"The estimator's delay is {delay}: set it to {needed}."]
+
+
+def _on_bounds(found: Analysis) -> list[str]:
+    if not found.bounds:
+        return []
+    last = found.bounds[-1]
+    possible = [channel.name for channel in found.attacks.channels if channel.delay is not None]
+    grown = [name for name in possible if last.attack[name] is False]
+    unsure = [name for name in possible if last.attack[name] is None]
+    said = []
+    if grown:
+        said.append(
+            f"With delay = {last.delay} the variance of the estimate of {_listed(grown)} grows "
+            f"without limit: it still did after {last.steps} steps."
+        )
+    if unsure:
+        said.append(
+            f"With delay = {last.delay} the variance of the estimate of {_listed(unsure)} had "
+            f"not settled after {last.steps} steps."
+        )
+    return said
+
+
+def _on_window(found: Analysis) -> list[str]:
+    window = found.window
+    if window is None:
+        return []
+    rows = f"the first {window.rows} determine" if window.rows else "all together do not determine"
+    said = [f"Of the {_steps(window.steps)} looked at, {rows} the state."]
+    for name, count in window.undetermined.items():
+        if count:
+            said.append(f"{name} is not determined by its own row at {count} of {window.steps}.")
+    return said
+
+
+def combination(vector: np.ndarray, names: Iterable[str]) -> str:
+    """A direction in words: the largest entry taken as 1, what is under 1e-6 of it left out.
+
+    The sign is such that the first name has none.
+    """
+    vector = vector / vector[np.argmax(np.abs(vector))]
+    first = vector[np.abs(vector) > 1e-6][0]
+    text = ""
+    for value, name in zip(-vector if first.real < 0 else vector, names, strict=True):
+        if abs(value) <= 1e-6:
+            continue
+        real = abs(value.imag) <= 1e-6 * abs(value)
+        size = f"{abs(value):.3g} " if real else f"({value:.3g}) "
+        minus = real and value.real < 0
+        text += (" - " if minus else " + ") * bool(text) + ("" if size == "1 " else size) + name
+    return text
+
+
+def _steps(count: int) -> str:
+    return f"{count} step{'s' if count != 1 else ''}"
+
+
+def _either(names: Iterable[str]) -> str:
+    return _joined([f'"{name}"' for name in names], "or")
+
+
+def _listed(names: Iterable[str]) -> str:
+    return _joined(list(names), "and")
+
+
+def _joined(names: list[str], word: str) -> str:
+    shown = names[:SHOWN] + ([f"{len(names) - SHOWN} more"] if len(names) > SHOWN else [])
+    return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} {word} {shown[-1]}"

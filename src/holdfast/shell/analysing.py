@@ -1,0 +1,160 @@
+"""`holdfast analyse`: what can be said of a scenario's plant before any data."""
+
+import json
+from typing import Any
+
+import numpy as np
+import rich.console
+import rich.table
+
+from holdfast.analysis.advice import advice
+from holdfast.analysis.whole import Analysis, analysis
+from holdfast.analysis.zeros import Zero
+from holdfast.loop import Scenario
+from holdfast.shell import runtime
+from holdfast.shell.calibrating import busy
+from holdfast.shell.scenario import read_scenario
+
+
+def analyse(scenario: str, as_json: bool, allow_python: bool) -> None:
+    """Analyse the plant of a scenario; print a table and sentences, or JSON."""
+    runtime.configure()
+    found = read_scenario(scenario, allow_python=allow_python).scenario
+    x0, P0 = _start(found)
+    with busy("analysing the plant"):
+        result = analysis(found.plant, x0, P0)
+    sentences = advice(result, getattr(found.monitor.estimator, "delay", None))
+    if as_json:
+        print(json.dumps(content(result, sentences), allow_nan=False, indent=1))
+    else:
+        _print(result, sentences)
+
+
+def _start(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
+    """The estimate before the first row; an estimator that has none: the plant's x0, and I."""
+    estimator = scenario.monitor.estimator
+    x0 = getattr(estimator, "x0", scenario.x0)
+    P0 = getattr(estimator, "P0", np.eye(len(scenario.plant.states)))
+    return np.asarray(x0, float), np.asarray(P0, float)
+
+
+def content(found: Analysis, sentences: list[str]) -> dict[str, Any]:
+    """The analysis as JSON has it: plain lists and numbers, None for what there is not."""
+    seen, steady, window = found.observability, found.steady, found.window
+    return {
+        "observable": seen.observable,
+        "observability_index": seen.rows,
+        "unobserved": [_named(v, found.model.states) for v in seen.hidden.T],
+        "eigenvalues": [_pair(value) for value in seen.eigenvalues],
+        "unstable": seen.unstable,
+        "steady_state": {
+            "K": None if steady.K is None else steady.K.tolist(),
+            "P": None if steady.P is None else steady.P.tolist(),
+            "P_pred": None if steady.P_pred is None else steady.P_pred.tolist(),
+            "reason": steady.reason,
+        },
+        "attacks": _attacks(found),
+        "window": None if window is None else window._asdict(),
+        "of": found.model.note or None,
+        "advice": sentences,
+    }
+
+
+def _attacks(found: Analysis) -> dict[str, Any]:
+    attacks, names = found.attacks, found.model.attacks
+    return {
+        "channels": {
+            channel.name: {
+                "direct": channel.direct,
+                "delay": channel.delay,
+                "reason": channel.reason,
+                "sensors": [sensor._asdict() for sensor in channel.sensors],
+            }
+            for channel in attacks.channels
+        },
+        "delay": attacks.delay,
+        "identified": all(channel.delay is not None for channel in attacks.channels),
+        "rank": attacks.transfer.rank,
+        "invisible": [_named(v, names) for v in attacks.transfer.lost.T],
+        "zeros": [_zero(zero, found) for zero in attacks.transfer.zeros],
+        "shields": list(attacks.shields),
+        "bounded": [bounds._asdict() for bounds in found.bounds],
+    }
+
+
+def _zero(zero: Zero, found: Analysis) -> dict[str, Any]:
+    model = found.model
+    return {
+        "z": _pair(zero.z),
+        "unstable": zero.unstable,
+        "multiplicity": zero.multiplicity,
+        "attack": [_complex(v, model.attacks) for v in zero.attack.T],
+        "state": [_complex(v, model.states) for v in zero.state.T],
+    }
+
+
+def _named(vector: np.ndarray, names: tuple[str, ...]) -> dict[str, float]:
+    return {name: float(value) for name, value in zip(names, vector, strict=True)}
+
+
+def _complex(vector: np.ndarray, names: tuple[str, ...]) -> dict[str, list[float]]:
+    return {name: _pair(value) for name, value in zip(names, vector, strict=True)}
+
+
+def _pair(value: complex) -> list[float]:
+    value = complex(value)
+    return [value.real + 0.0, value.imag + 0.0]
+
+
+def _print(found: Analysis, sentences: list[str]) -> None:
+    console = rich.console.Console()
+    table = rich.table.Table(show_header=False, box=None, pad_edge=False)
+    for name, text in _rows(found):
+        table.add_row(name, text)
+    console.print(table)
+    if found.attacks.channels:
+        console.print(_channels(found))
+    for sentence in sentences:
+        console.print(f"- {sentence}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _rows(found: Analysis) -> list[tuple[str, str]]:
+    seen, steady = found.observability, found.steady
+    index = "" if seen.rows is None else f", from {seen.rows} row{'s' if seen.rows > 1 else ''}"
+    rows = [
+        ("observable", f"{'yes' if seen.observable else 'no'}{index}"),
+        ("eigenvalues", ", ".join(f"{_number(value)}" for value in seen.eigenvalues)),
+        ("unstable", str(seen.unstable)),
+    ]
+    if steady.P is not None:
+        deviations = zip(found.model.states, np.sqrt(np.diagonal(steady.P)), strict=True)
+        rows.append(("steady-state sd", ", ".join(f"{n} {sd:.3g}" for n, sd in deviations)))
+    if found.attacks.transfer.zeros:
+        zeros = ", ".join(
+            _number(zero.z) + (f" ({zero.multiplicity} times)" if zero.multiplicity > 1 else "")
+            for zero in found.attacks.transfer.zeros
+        )
+        rows.append(("invariant zeros", zeros))
+    return rows
+
+
+def _channels(found: Analysis) -> rich.table.Table:
+    table = rich.table.Table(box=None, pad_edge=False)
+    for heading in ("attack", "enters", "identified with delay", "variance settles"):
+        table.add_column(heading)
+    last = found.bounds[-1]
+    words = {True: "yes", False: "no", None: f"not within {last.steps} steps"}
+    for channel in found.attacks.channels:
+        never = channel.delay is None
+        table.add_row(
+            channel.name,
+            "an output" if channel.direct else "the state",
+            "never" if never else str(channel.delay),
+            "-" if never else words[last.attack[channel.name]],
+        )
+    return table
+
+
+def _number(value: complex) -> str:
+    value = complex(value)
+    return f"{value.real:.4g}" if abs(value.imag) <= 1e-12 * abs(value) else f"{value:.4g}"

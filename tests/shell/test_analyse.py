@@ -1,0 +1,124 @@
+"""`holdfast analyse`: JSON that others rely on, a table, and errors."""
+
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+
+from shell_samples import SCENARIO
+
+
+def analysed(command, path):
+    code, out, err = command("analyse", path, "--json")
+    assert (code, err) == (0, "")
+    return json.loads(out, parse_constant=lambda word: pytest.fail(f"{word} in the JSON"))
+
+
+def numbers(value):
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list):
+        return [n for one in value for n in numbers(one)]
+    return [value] if isinstance(value, float) else []
+
+
+def test_json_has_what_others_rely_on(folder, command):
+    found = analysed(command, folder / "scenario.toml")
+    assert found["observable"] is True
+    assert (found["observability_index"], found["unstable"]) == (1, 2)
+    assert found["eigenvalues"] == [[1.0, 0.0], [1.0, 0.0]]
+    A, C = np.array([[1.0, 0.1], [0.0, 1.0]]), np.eye(2)
+    Q, R = np.diag([1e-6, 1e-4]), np.diag([0.25, 0.0025])
+    steady = {name: np.array(found["steady_state"][name]) for name in ("K", "P", "P_pred")}
+    # the equations of the fixed point, to the accuracy at which the recursion stops
+    S = C @ steady["P_pred"] @ C.T + R
+    np.testing.assert_allclose(steady["K"] @ S, steady["P_pred"] @ C.T, rtol=1e-9)
+    P = (np.eye(2) - steady["K"] @ C) @ steady["P_pred"]
+    np.testing.assert_allclose(steady["P"], P, rtol=1e-7)
+    np.testing.assert_allclose(steady["P_pred"], A @ steady["P"] @ A.T + Q, rtol=1e-7)
+    attacks = found["attacks"]
+    assert attacks["channels"]["accel_attack"]["delay"] == 0
+    assert (attacks["identified"], attacks["delay"], attacks["rank"]) == (True, 0, 1)
+    assert attacks["bounded"][0]["attack"] == {"accel_attack": True}
+    assert found["advice"] == []
+    assert found["window"] is None
+    assert all(math.isfinite(number) for number in numbers(found))
+
+
+def test_null_where_there_is_none(folder, command):
+    """Only the speed is measured: the position is not observable."""
+    text = SCENARIO.replace("C = [[1.0, 0.0], [0.0, 1.0]]", "C = [[0.0, 1.0]]")
+    text = text.replace("R = [[0.25, 0.0], [0.0, 0.0025]]", "R = [[0.0025]]")
+    text = text.replace('["gps", "wheel"]', '["wheel"]').replace("sensor:gps", "sensor:wheel")
+    (folder / "speed.toml").write_text(text)
+    found = analysed(command, folder / "speed.toml")
+    assert (found["observable"], found["observability_index"]) == (False, None)
+    assert found["unobserved"] == [{"position": 1.0, "speed": 0.0}]
+    assert [found["steady_state"][name] for name in ("K", "P", "P_pred")] == [None] * 3
+    assert "unstable mode 1" in found["steady_state"]["reason"]
+    assert any('measure "position"' in sentence for sentence in found["advice"])
+
+
+def test_a_table_and_sentences(folder, command):
+    text = SCENARIO.replace("G = [[0.005], [0.1]]", "G = [[0.0], [0.1]]")
+    text = text.replace("C = [[1.0, 0.0], [0.0, 1.0]]", "C = [[1.0, 0.0]]")
+    text = text.replace("R = [[0.25, 0.0], [0.0, 0.0025]]", "R = [[0.25]]")
+    text = text.replace('["gps", "wheel"]', '["gps"]')
+    text = text.replace('kind = "kalman"', 'kind = "unknown_input"')
+    (folder / "late.toml").write_text(text)
+    code, out, err = command("analyse", folder / "late.toml")
+    assert (code, err) == (0, "")
+    assert re.search(r"observable +yes, from 2 rows", out)
+    assert re.search(r"accel_attack +the state +1 +yes", out)
+    assert 'set delay = 1, or measure "speed" and it is identified at once.' in out
+    assert "The estimator's delay is 0: set it to 1." in out
+
+
+def test_matrices_per_step(folder, command):
+    C = np.zeros((6, 1, 2))
+    C[:3, 0, 0] = C[3:, 0, 1] = 1.0
+    np.savez(folder / "plant.npz", C=C)
+    text = SCENARIO.replace(
+        "C = [[1.0, 0.0], [0.0, 1.0]]", 'C = { file = "plant.npz", name = "C" }'
+    ).replace("A = [[1.0, 0.1], [0.0, 1.0]]", "A = [[1.0, 0.0], [0.0, 0.9]]")
+    text = text.replace("R = [[0.25, 0.0], [0.0, 0.0025]]", "R = [[0.25]]")
+    text = text.replace('["gps", "wheel"]', '["gps"]')
+    (folder / "steps.toml").write_text(text)
+    found = analysed(command, folder / "steps.toml")
+    assert found["of"] == "the matrices of step 1 of 6"
+    # of step 1 alone the speed is hidden, over the window the fourth row shows it
+    assert found["observable"] is False
+    assert found["window"] == {"steps": 6, "rows": 4, "undetermined": {"accel_attack": 0}}
+
+
+def test_a_nonlinear_plant_is_linearised(folder, command):
+    (folder / "pendulum.py").write_text(
+        "import jax.numpy as jnp, numpy as np\n"
+        "from holdfast.plants.nonlinear import nonlinear_plant\n"
+        "def make():\n"
+        "    f = lambda x, u, d: x + 0.1 * jnp.array([x[1], -jnp.sin(x[0]) + d[0]])\n"
+        "    return nonlinear_plant(f, lambda x, u, d: x[:1], Q=np.eye(2), R=np.eye(1), dt=0.1,\n"
+        "        states=('angle', 'rate'), outputs=('encoder',), attacks=('torque',))\n"
+    )
+    (folder / "nonlinear.toml").write_text(
+        '[plant]\nkind = "python"\ntarget = "pendulum:make"\n'
+        '[estimator]\nkind = "extended"\nx0 = [0.0, 0.0]\nP0 = [[1.0, 0.0], [0.0, 1.0]]\n'
+        '[detector]\nkind = "chi_square"\non = "residual"\n'
+    )
+    code, out, _ = command("analyse", folder / "nonlinear.toml", "--json", "--allow-python")
+    assert code == 0
+    found = json.loads(out)
+    # x' = (1, 0.1; -0.1, 1) x about rest: 1 +- 0.1 i
+    np.testing.assert_allclose(found["eigenvalues"], [[1.0, 0.1], [1.0, -0.1]], rtol=1e-12)
+    assert found["attacks"]["channels"]["torque"]["delay"] == 1
+    assert "linearised" in found["of"]
+    assert found["of"] in found["advice"][0]
+
+
+def test_errors_are_those_of_the_other_commands(folder, command):
+    code, out, err = command("analyse", folder / "absent.toml", "--json")
+    assert (code, out) == (2, "")
+    assert "absent.toml" in err
+    assert err.count("\n") == 1
