@@ -3,10 +3,11 @@
 The printed proof needs Qbar = (I - G M C) Q (I - G M C)' to be positive definite, but
 (I - G M C) G = 0 wherever the attack estimate is unbiased, so Qbar is singular as soon as
 there is an attack: the printed delta is 1 and no rate is left. It needs ||I - gamma B|| = 1
-too, which oblique projections exceed. The statement itself survives for the filter in its
-steady state: the noise of the measurement fills the directions that Qbar leaves out, and a
-projection with the weight P^-1 onto a set that holds the truth does not lengthen the error in
-that norm.
+too, which oblique projections exceed. The statement itself survives for the filter that runs
+on unprojected, in its steady state: the noise of the measurement fills the directions that Qbar
+leaves out, and a projection with the weight P^-1 onto a set that holds the truth does not
+lengthen the error in that norm. Where P of (27) is carried on it can fail: an unstable plant
+can be held on a face for ever (`holdfast papers care`, Theorem 13).
 """
 
 import itertools

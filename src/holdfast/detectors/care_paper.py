@@ -1,9 +1,10 @@
 """The detector of the CARE paper, to the letter: a cumulative test on the projected estimate.
 
 **It detects less than the same test without the projection; use `likelihood_ratio` or `cusum`.**
-Theorem 9 of the paper says the opposite by inverting a singular matrix. With any well-defined
-statistic the projection makes the test weaker: 0 in the limits implies that the projected
-estimate is the shorter one. `holdfast papers care` prints the false-negative rates of every
+Theorem 9 of the paper says the opposite by inverting a singular matrix. Where 0 is within the
+limits the projected estimate is never the longer one, measured by the covariance before the
+projection; with the pseudo-inverse of the singular covariance single rows can be longer, but
+far more are shorter. `holdfast papers care` prints the false-negative rates of every
 reading of the statistic on the paper's own example.
 """
 

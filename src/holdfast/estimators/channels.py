@@ -1,14 +1,13 @@
 """Where the attack channels of a plant enter, whatever the numbers: found once, on the host."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from holdfast.numerics.linalg import RANK_TOLERANCE
 from holdfast.parts import Plant
-from holdfast.plants.linear import LinearPlant, Matrices, Table
+from holdfast.plants.linear import LinearPlant, Table
 from holdfast.plants.local import motion, sensing
 
 
@@ -34,20 +33,20 @@ def _over_time(plant: Plant, x0: np.ndarray, of: Find) -> np.ndarray:
     """
     if not isinstance(plant, LinearPlant):
         return of(*_generic(plant, x0))
-    sources = {name: getattr(plant, name) for name in Matrices._fields}
-    lengths = [len(v) for v in sources.values() if not isinstance(v, Table) and v.ndim == 3]
+    given = [getattr(plant, name) for name in "CGH"]
+    # copied once: an entry of a JAX array takes a millisecond's worth of dispatch
+    sources = [np.asarray(v.values if isinstance(v, Table) else v) for v in given]
+    per_step = [
+        v.ndim == 3 and not isinstance(g, Table) for v, g in zip(sources, given, strict=True)
+    ]
+    lengths = [len(v) for v, moves in zip(sources, per_step, strict=True) if moves]
+    grids = [len(v) for v in sources if v.ndim == 3]
+    count = min(lengths) if lengths else max(grids, default=1)
 
-    def entry(source, i) -> Any:
-        if isinstance(source, Table):
-            return np.asarray(source.values)[i % len(source.values)]
-        return np.asarray(source if source.ndim == 2 else source[i])
+    def entry(source: np.ndarray, i: int) -> np.ndarray:
+        return source if source.ndim == 2 else source[i % len(source)]
 
-    if lengths:
-        each = range(min(lengths))
-    else:
-        grids = [len(v.values) for v in sources.values() if isinstance(v, Table)]
-        each = range(max(grids, default=1))
-    found = np.stack([of(*(entry(sources[name], i) for name in "CGH")) for i in each])
+    found = np.stack([of(*(entry(source, i) for source in sources)) for i in range(count)])
     return found if lengths else np.asarray(np.all(found, 0))
 
 

@@ -107,7 +107,7 @@ def project(
     8 (m + 1), which only rounding can make it reach: one problem of those with a covariance
     of condition 1e11 did, and its ``residual`` was 8e-9 instead of 1e-12 or less.
 
-    Source: Goldfarb and Idnani (1983), the dual method; CARE (20), (26).
+    Source: Goldfarb and Idnani (1983), the dual method; CARE (18) to (20), (24) to (26).
     """
     if rows.size == 0:
         none = jnp.zeros(bound.shape, bool), jnp.zeros(bound.shape), jnp.zeros(())

@@ -45,7 +45,7 @@ PANELS = 12
 
 Window = tuple[float, float] | None
 
-_STYLE: Any = {
+STYLE: Any = {
     "svg.fonttype": "none",
     "svg.hashsalt": "holdfast",
     "path.simplify": False,
@@ -93,7 +93,7 @@ NARROW = Layout(3.9, 1, 180)
 def svg(figure: Figure) -> str:
     """The figure as SVG text, the same for the same data."""
     target = io.StringIO()
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         FigureCanvasSVG(figure).print_svg(target, metadata={"Date": None, "Creator": None})
     return lighter(target.getvalue())
 
@@ -116,7 +116,7 @@ def residuals(data: xr.Dataset, window: Window, layout: Layout = WIDE) -> Figure
     known = np.isfinite(variance) & (variance > 0)
     scaled = np.where(known, data.residual.values / np.sqrt(np.where(known, variance, 1)), np.nan)
     t = data.time.values
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure, panels = _panels(_names(data, "output", unit=False), layout)
         for i, panel in enumerate(panels):
             _shade(panel, t, window)
@@ -138,7 +138,7 @@ def statistic(data: xr.Dataset, window: Window, layout: Layout = WIDE) -> Figure
     t, bins = data.time.values, layout.bins * layout.columns
     value, alarm = data.statistic.values, data.alarm.values
     threshold = np.where(np.isfinite(data.threshold.values), data.threshold.values, np.nan)
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure, panel = _one_panel(layout, 2.6)
         _shade(panel, t, window)
         _line(panel, t, value, bins, color=MAIN, lw=0.9)
@@ -171,7 +171,7 @@ def samples(data: xr.Dataset, layout: Layout = WIDE) -> Figure:
     # a trace of what is rare must show: one lost sample in a bin of hundreds
     picture[..., 3] = np.where(bad, 1.0, np.where(lost > 0, 0.25 + 0.65 * lost, 0.0))
     dt = float(data.attrs["dt"])
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure, panel = _one_panel(layout, 0.75 + 0.22 * len(names))
         panel.imshow(picture, aspect="auto", interpolation="nearest",
                      extent=(t[0] - dt, t[-1], len(names), 0))  # fmt: skip
@@ -193,7 +193,7 @@ def trade_off(curve: TradeOff, chosen: tuple[float, float] | None, layout: Layou
     ``chosen``: (episodes, delay) of the threshold in use.
     """
     caught = np.isfinite(curve.delay)
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure, panel = _one_panel(layout, 2.6, time=False)
         panel.set_xlabel("false-alarm episodes before the attack")
         panel.set_ylabel("delay (s)")
@@ -218,7 +218,7 @@ def path(data: xr.Dataset, place: tuple[str, str], layout: Layout = WIDE) -> Fig
     """The way on a map, ``place`` naming the states east and north: estimated, measured, true."""
     measured = map_pair(data.output.values)
     keep = slice(None, None, max(1, len(data.time) // (6 * layout.bins)))
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure, panel = _one_panel(layout, min(4.2, layout.width), time=False)
         panel.set_xlabel(_label(data, "state", place[0]))
         panel.set_ylabel(_label(data, "state", place[1]))
@@ -247,7 +247,7 @@ def _bands(data, name, truth, window, layout, *, zero=False) -> Figure:
     t, value = data.time.values, data[name].values
     variance = np.diagonal(data[f"{name}_cov"].values, axis1=-2, axis2=-1)
     sd = np.sqrt(np.where(np.isfinite(variance), variance, np.nan))
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure, panels = _panels(_names(data, kind), layout)
         for i, panel in enumerate(panels):
             _shade(panel, t, window)

@@ -1,0 +1,1 @@
+"""The papers' examples and claims, run again and judged."""

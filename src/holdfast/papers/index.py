@@ -1,0 +1,8 @@
+"""The papers that have been built, by the name the command gives them."""
+
+from collections.abc import Callable
+
+from holdfast.papers import care
+from holdfast.papers.rows import Study
+
+STUDIES: dict[str, Callable[[], Study]] = {"care": care.study}
