@@ -224,12 +224,18 @@ class UnknownInput(Estimator):
         def again(carry):
             count, at, _, _ = carry
             row = self._row(state, observation, at)
-            unknown = row.structure.unknown
-            z = jnp.where(unknown, _about(at, row.z.shape[0]), row.z)
-            after = _Point(at.x_before, z[n + nd : n + 2 * nd], z[:n], z[n : n + nd])
-            step = jnp.abs(z - _about(at, row.z.shape[0]))[: n + 2 * nd]
-            deviation = jnp.sqrt(jnp.maximum(jnp.diagonal(row.P), 0.0))[: n + 2 * nd]
-            return count + 1, after, row, jnp.any(step > SETTLED * deviation + 1e-12)
+            near, size = _about(at), n + 2 * nd
+            z = jnp.where(row.structure.unknown[:size], near, row.z[:size])
+            # only possible points: beyond the limits a plant may bend any way
+            after = _Point(
+                x,
+                self.plant.saturated(k, u, z[n + nd :]),
+                self.plant.confined(k, u, z[:n]),
+                self.plant.saturated(k, u, z[n : n + nd]),
+            )
+            deviation = jnp.sqrt(jnp.maximum(jnp.diagonal(row.P)[:size], 0.0))
+            moved = jnp.abs(_about(after) - near) > SETTLED * deviation + 1e-12
+            return count + 1, after, row, jnp.any(moved)
 
         at = _Point(x, d, self.plant.transition(k, x, u, d), jnp.zeros(nd))
         first = again((0, at, None, None))
@@ -338,10 +344,9 @@ def _new_attack(H, trusted) -> Float[Array, "nd nd"]:
     )
 
 
-def _about(at: _Point, size: int) -> Float[Array, " w"]:
-    """The linearisation point in the order of z; nothing is linearised in older attacks."""
-    near = jnp.concatenate([at.x, at.d, at.d_before])
-    return jnp.pad(near, (0, size - near.shape[0]))
+def _about(at: _Point) -> Float[Array, " m"]:
+    """The linearisation point in the order of z: x_k, d_k, d_{k-1}."""
+    return jnp.concatenate([at.x, at.d, at.d_before])
 
 
 def _with_unknown(cov: Float[Array, "m m"], unknown: Bool[Array, " m"]) -> Float[Array, "m m"]:

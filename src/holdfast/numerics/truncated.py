@@ -100,14 +100,15 @@ def restricted(
     covariance is positive semidefinite.
 
     Accuracy, in standard deviations of what is found. One slab: 1e-10 at 800 deviations from
-    the mean, 1e-13 near it. Two: 1e-10 at any correlation. Three: 2e-8 up to a correlation of
-    0.99 for all of them, 1e-6 up to exactly dependent ones (a triangle in the plane). More
+    the mean, 1e-13 near it. Two: 1e-10 at any correlation. Three: 3e-9 up to correlations of
+    0.99 between all of them, 3e-7 up to exactly dependent ones (a triangle in the plane). More
     slabs: expectation propagation, 0.1 at worst; see `propagate`. ``log_probability`` is
     log P(rows z <= bound), finite also for a set without interior (about -700 for one slab;
     two or three are counted as `NARROWEST` wide each).
 
-    Cost on one core inside a compiled loop: one slab 1 us, two 40 us, three 0.5 to 1 ms (4 ms
-    a problem under `jax.vmap`, which computes the empty pieces too), six 60 us.
+    Cost on one core inside a compiled loop: one slab 1 us, two 40 us, three 0.5 to 1 ms (5 ms
+    a problem under `jax.vmap`, which computes the empty pieces too), six 60 us; nothing where
+    every bound is out of reach.
 
     Source: Tallis, J. R. Statist. Soc. B 23 (1961), the regression of z on w; Cunningham,
     Hennig and Lacoste-Julien, arXiv:1111.6832 (2011), expectation propagation.

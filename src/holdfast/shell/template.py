@@ -65,6 +65,15 @@ x0 = [0.0, 0.0]                 # the true initial state (run only)
 # attack = { matrix = [[1], [-1]], bound = [3.5, 3.5] }
 """
 
+EXAMPLES: dict[str, dict[str, Any]] = {
+    "bicycle": {
+        "plant": {"length": 100.0},
+        "x0": [2.0, 2.5, 0.0, 10.0],
+        "channel": "channel:accel_attack",
+    },
+}
+"""What suits a plant better than zeros: where it starts, and what to attack."""
+
 RUN = """\
 [run]
 steps = 300
@@ -83,9 +92,14 @@ def scenario_text(kind: str | None) -> str:
             raise InputError("new", "KIND", repr(kind), one_of(known, kind))
         kinds[section] = kind
     build = SECTIONS["plant"][kinds["plant"]]
-    plant_text = LINEAR if kinds["plant"] == "linear" else _table("plant", kinds["plant"], build, 0)
+    example = EXAMPLES.get(kinds["plant"], {})
+    plant_text = LINEAR
+    if kinds["plant"] != "linear":
+        plant_text = _table("plant", kinds["plant"], build, 0, example.get("plant"))
     plant = _built(plant_text, kinds["plant"])
-    start = _start(plant)
+    start = _start(plant) | {name: example[name] for name in ("x0",) if name in example}
+    if "x0" in example:
+        plant_text += _line("x0", example["x0"], "the true initial state (run only)") + "\n"
     estimator = SECTIONS["estimator"][kinds["estimator"]](plant, *map(np.asarray, start.values()))
     notes = {"x0": "estimate one sample before the first row", "P0": "and its covariance"}
     build = SECTIONS["estimator"][kinds["estimator"]]
@@ -98,7 +112,7 @@ def scenario_text(kind: str | None) -> str:
     for section, given in values.items():
         if section in kinds:
             build = SECTIONS[section][kinds[section]]
-            given = given or _injection(build, plant)
+            given = given or _injection(build, plant, example.get("channel"))
             parts.append(_table(section, kinds[section], build, 1, given))
     return "\n".join([*parts, RUN])
 
@@ -126,15 +140,16 @@ def _weights(plant: Plant) -> dict[str, Any]:
     return {name: _identity(size) for name, size in sizes.items()}
 
 
-def _injection(build: Callable[..., Any], plant: Plant) -> dict[str, Any]:
+def _injection(build: Callable[..., Any], plant: Plant, channel: str | None) -> dict[str, Any]:
     """What an attack needs: where, when, and the keys without default."""
     fields = model_of(build, 1).model_fields
     # what plays back recorded samples cannot hit an attack channel, which carries none
     target = f"sensor:{plant.outputs[0]}"
     if "value" in fields and plant.attacks:
-        target = f"channel:{plant.attacks[0]}"
+        target = channel or f"channel:{plant.attacks[0]}"
     needed = {name: REQUIRED[name] for name in fields if name in REQUIRED}
-    return {"channel": target, "start": 10.0, "stop": 20.0, **needed}
+    begin = 100 * plant.dt
+    return {"channel": target, "start": begin, "stop": 2 * begin, **needed}
 
 
 def _table(
