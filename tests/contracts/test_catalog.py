@@ -34,8 +34,13 @@ def walker(**changes):
     return linear_plant(**(keys | changes))
 
 
+LIMITS = {
+    "state": {"matrix": [[1.0, 0.0], [-1.0, 0.0]], "bound": [1.5, 1.5]},
+    "attack": {"matrix": [[0.0, 1.0]], "bound": [1.0], "bound_u": [[-1.0]]},
+}
 PLANTS = {
     "both": walker(),
+    "limits": walker(constraints=LIMITS),
     "sensor attack alone": walker(G=[[0.0], [0.0]], H=[[1.0], [0.0], [0.0]], attacks=["spoof"]),
     "actuator attack alone": walker(G=[[0.005], [0.1]], H=[[0.0]] * 3, attacks=["push"]),
     "no attack": walker(G=None, H=None, attacks=None),
@@ -43,13 +48,21 @@ PLANTS = {
 X0, P0 = np.array([0.3, -0.2]), np.array([[2.0, 0.3], [0.3, 1.0]])
 
 # What each kind is given beyond its defaults. A new entry of the catalog needs a line here.
-ESTIMATOR_SETTINGS = {"kalman": {}, "unknown_input": {}, "extended": {}, "unscented": {}}
+ESTIMATOR_SETTINGS = {
+    "kalman": {},
+    "unknown_input": {},
+    "care": {},
+    "extended": {},
+    "unscented": {},
+}
 DETECTOR_SETTINGS = {
     "chi_square": {},
     "windowed": {"length": 4},
     "cusum": {"forgetting": 0.3},
     "sprt": {},
     "per_channel": {},
+    "likelihood_ratio": {},
+    "care_paper": {"forgetting": 0.3},
 }
 ATTACK_SETTINGS = {
     "bias": {"value": 2.0},
@@ -81,8 +94,13 @@ def test_every_entry_is_covered(catalog, covered):
 @pytest.mark.parametrize(
     ("kind", "plant"),
     # what the attacks of the plant are concerns only those that estimate them
-    [(kind, "both") for kind in ESTIMATOR_SETTINGS]
-    + [("unknown_input", name) for name in PLANTS if name != "both"],
+    [(kind, "limits" if kind == "care" else "both") for kind in ESTIMATOR_SETTINGS]
+    + [
+        ("unknown_input", "actuator attack alone"),
+        # the same code on parts of the plant above
+        pytest.param("unknown_input", "sensor attack alone", marks=pytest.mark.slow),
+        pytest.param("unknown_input", "no attack", marks=pytest.mark.slow),
+    ],
 )
 def test_estimators(kind, plant):
     settings = ESTIMATOR_SETTINGS[kind]
