@@ -1,10 +1,28 @@
 """One set-up for all tests: 64 bits, strict promotion, run-time types, one thread."""
 
+import atexit
 import os
+import shutil
+import sys
+import tempfile
 from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"
 os.environ["HOLDFAST_CACHE"] = "off"  # tests compile what they test
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    # once for all workers of this session, and gone with it
+    _compiled = tempfile.mkdtemp(prefix="holdfast-tests-")
+    atexit.register(shutil.rmtree, _compiled, ignore_errors=True)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = _compiled
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
+if "slow" not in sys.argv:
+    # most of the quick tier's time is compilation, which optimises little here; the slow tier
+    # runs the code as users get it
+    os.environ.setdefault(
+        "XLA_FLAGS",
+        "--xla_backend_optimization_level=0 "
+        "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=16777216",
+    )
 
 import hypothesis
 import jax

@@ -186,7 +186,7 @@ def test_the_projected_statistic_is_the_weaker_one():
 
 @pytest.mark.parametrize("make", [
     lambda plant: likelihood_ratio.build(plant, level=0.05),
-    lambda plant: care_paper.build(plant, level=0.05),
+    pytest.param(lambda plant: care_paper.build(plant, level=0.05), marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_calibrated_levels(make):
     """Fresh runs at the calibrated threshold: 3 standard errors of calibration and check."""

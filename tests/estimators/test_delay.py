@@ -79,7 +79,7 @@ def check_late_attacks(delay, direct, delays):
             late = np.isfinite(np.asarray(got.d_cov)[given + 1 :, 0, 0])
             assert np.all(late == (given >= delay))
             known_attacks += late.sum()
-    assert known_attacks > 20
+    assert known_attacks > 10
 
 
 def test_a_push_on_a_cart_is_known_one_row_late():

@@ -59,18 +59,22 @@ class Study:
     figures: Callable[[], dict[str, Any]]
 
 
-def claim(id: str, what: str, paper: Any, ours: Any, holds: bool, note: str = "") -> Row:
+Truth = bool | np.bool_
+"""What a comparison of NumPy numbers gives."""
+
+
+def claim(id: str, what: str, paper: Any, ours: Any, holds: Truth, note: str = "") -> Row:
     """A statement that is true or false of what was computed."""
     return Row(id, what, paper, _plain(ours), None, "holds" if holds else "fails", note)
 
 
-def claim_over_seeds(id: str, what: str, paper: Any, per_seed, holds: bool, note: str = "") -> Row:
+def claim_over_seeds(id: str, what: str, paper: Any, per_seed, holds: Truth, note: str = "") -> Row:
     """A statement judged on a number per seed, given by its mean and standard deviation."""
     mean, spread = _over_seeds(per_seed)
     return Row(id, what, paper, mean, spread, "holds" if holds else "fails", note)
 
 
-def figure(id: str, what: str, paper: Any, per_seed, shows: bool, note: str = "") -> Row:
+def figure(id: str, what: str, paper: Any, per_seed, shows: Truth, note: str = "") -> Row:
     """What a figure shows, judged on numbers per seed."""
     mean, spread = _over_seeds(per_seed)
     return Row(id, what, paper, mean, spread, "reproduced" if shows else "not reproduced", note)
