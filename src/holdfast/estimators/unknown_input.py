@@ -37,8 +37,8 @@ from holdfast.plants.linear import LinearPlant
 from holdfast.plants.local import motion, sensing
 from holdfast.records import Estimate, Observation, Status
 
-PASSES = 20
-"""Linearisations of a nonlinear plant at one row, at most."""
+PASSES = 6
+"""Linearisations of a nonlinear plant at one row, at most: Newton's method doubles the digits."""
 SETTLED = 1e-3
 """Move of the linearisation point, in standard deviations of the estimate, taken as none."""
 
