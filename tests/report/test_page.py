@@ -11,8 +11,8 @@ import pytest
 import xarray as xr
 
 import demo
-from holdfast.records import Reason
-from holdfast.report import page, words
+from holdfast.records import Reason, Status
+from holdfast.report import page, sections, words
 from holdfast.report.tables import dataset, summary
 
 EVIL = "<script>alert('x')</script> & \"co\""
@@ -155,3 +155,15 @@ def test_every_reason_can_be_said():
     for reason in Reason:
         episode = {"words": reason.words, "reason": reason.name, "channel": "gps"}
         assert "gps" in words.reason(episode)
+
+
+def test_the_share_of_rows_with_contradictory_limits_is_printed(plant, flight):
+    """Of all rows, though a row may carry several statuses."""
+    bits = np.zeros(600, np.int32)
+    bits[:30] = int(Status.INFEASIBLE)
+    bits[:12] |= int(Status.MISSING)
+    marked = eqx.tree_at(lambda t: t.estimate.status, flight, jnp.asarray(bits))
+    text = str(sections.quality(summary(marked, plant, demo.time_of(marked))))
+    row = text[text.index("INFEASIBLE") :]
+    assert row.index(">30<") < row.index(f">{words.percent(0.05)}<")
+    assert "contradict" in row

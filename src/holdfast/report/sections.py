@@ -197,10 +197,9 @@ def quality(summary: Mapping[str, Any]) -> Markup:
                Column("One of the two", True)]  # fmt: skip
     lost = any(any(found.values()) for found in summary["data"].values())
     parts = [table(columns, rows) if lost else element("p", "Every sample arrived and was sound.")]
-    total = summary["rows"] * summary["runs"]
-    if summary["status"]["OK"] < total:
+    if summary["status"]["OK"] < samples:
         status = [
-            [name, str(n), f"{n / total:.2%}", _STATUS.get(name, "")]
+            [name, str(n), percent(n / samples), _STATUS.get(name, "")]
             for name, n in summary["status"].items()
         ]
         columns = [Column("Status"), Column("Rows", True), Column("Share", True), Column("Meaning")]
