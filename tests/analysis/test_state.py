@@ -7,11 +7,15 @@ from analysis.batch import determined
 from analysis.models import model, plant
 from holdfast.analysis.model import models_over
 from holdfast.analysis.observability import observability, rows_until_observable
-from holdfast.analysis.steady_state import steady_state
+from holdfast.numerics.steady_state import steady_state
 
 
 def stacked(A, C, count):
     return np.vstack([C @ np.linalg.matrix_power(A, k) for k in range(count)])
+
+
+def riccati(m):
+    return m.A, m.C, m.Q, m.R
 
 
 def no_attack(A, C, **more):
@@ -84,7 +88,7 @@ def test_steady_state_is_where_the_recursion_goes():
         root, spread = rng.normal(size=(n, n)), rng.normal(size=(ny, ny))
         R = spread @ spread.T + 0.1 * np.eye(ny)
         m = no_attack(A, rng.normal(size=(ny, n)), Q=root @ root.T + 0.1 * np.eye(n), R=R)
-        found = steady_state(m)
+        found = steady_state(*riccati(m))
         assert found.reason is None
         for ours, wanted in zip(found[:3], recursion(m, 2000), strict=True):
             # both sit at the fixed point of a contraction: rounding of numbers of this size
@@ -92,18 +96,18 @@ def test_steady_state_is_where_the_recursion_goes():
 
 
 def test_no_steady_state_where_a_mode_is_not_seen():
-    found = steady_state(no_attack(np.diag([1.1, 0.5]), np.array([[0.0, 1.0]])))
+    found = steady_state(*riccati(no_attack(np.diag([1.1, 0.5]), np.array([[0.0, 1.0]]))))
     assert found[:3] == (None, None, None)
     assert "do not see the unstable mode 1.1" in found.reason
 
 
 def test_no_steady_state_where_a_constant_has_no_noise():
     m = no_attack(np.diag([1.0, 0.5]), np.eye(2), Q=np.diag([0.0, 0.1]))
-    assert "no noise excites the mode 1" in steady_state(m).reason
+    assert "no noise excites the mode 1" in steady_state(*riccati(m)).reason
 
 
 def test_an_unstable_mode_without_noise_settles():
     """P_pred of x' = 2 x, y = x + v without process noise: p = 4 p / (p + 1), so p = 3."""
-    found = steady_state(no_attack(np.array([[2.0]]), np.eye(1), Q=np.zeros((1, 1))))
+    found = steady_state(*riccati(no_attack(np.array([[2.0]]), np.eye(1), Q=np.zeros((1, 1)))))
     np.testing.assert_allclose(found.P_pred, [[3.0]], rtol=1e-9)
     np.testing.assert_allclose(found.K, [[0.75]], rtol=1e-9)

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from holdfast.analysis.model import Model
-from holdfast.analysis.subspaces import TOLERANCE, kernel, left_free, scaled, silent, span
 from holdfast.analysis.zeros import Transfer, transfer
+from holdfast.numerics.subspaces import TOLERANCE, kernel, left_free, scaled, silent, span
 
 
 class Sensor(NamedTuple):

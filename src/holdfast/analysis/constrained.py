@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from holdfast.analysis.subspaces import kernel, legible, scaled
+from holdfast.numerics.subspaces import kernel, legible, scaled
 
 ROUNDING = 1e-9
 """Part of its size without cancellation that an entry may be off and still count as exact."""
@@ -44,7 +44,7 @@ def rank_condition(C: np.ndarray, G: np.ndarray) -> RankCondition:
     """Whether rank(C G) = nd, without which no M with M C G = I exists; else what is hidden.
 
     C (ny x n), G (n x nd). Entries of C G that are under `ROUNDING` of |C| |G| are zero; rank
-    as in `holdfast.analysis.subspaces`, so units do not matter.
+    as in `holdfast.numerics.subspaces`, so units do not matter.
 
     Source: CARE, Remark 4 (there called sufficient; it is also necessary).
     """

@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from holdfast.analysis.model import Model
-from holdfast.analysis.subspaces import (
+from holdfast.numerics.steady_state import UNSTABLE
+from holdfast.numerics.subspaces import (
     Scaled,
     complement,
     legible,
@@ -14,9 +15,6 @@ from holdfast.analysis.subspaces import (
     silent,
     span,
 )
-
-UNSTABLE = 1.0 - 1e-7
-"""Modulus from which an eigenvalue or a zero counts as unstable."""
 
 
 class Observability(NamedTuple):
@@ -38,7 +36,7 @@ class Observability(NamedTuple):
 def observability(model: Model) -> Observability:
     """Rank of [C; C A; ...; C A^(v-1)], the smallest v for which it is n, and the modes of A.
 
-    ``unstable`` counts |lambda| >= 1 - 1e-7. Ranks as in `holdfast.analysis.subspaces`.
+    ``unstable`` counts |lambda| >= 1 - 1e-7. Ranks as in `holdfast.numerics.subspaces`.
     """
     told = silent(_unattacked(model))
     n = len(model.states)

@@ -8,7 +8,7 @@ from holdfast.analysis.attacks import Identifiability, identifiability, undeterm
 from holdfast.analysis.boundedness import Bounds, bounds
 from holdfast.analysis.model import Model, model_at, models_over
 from holdfast.analysis.observability import Observability, observability, rows_until_observable
-from holdfast.analysis.steady_state import SteadyState, steady_state
+from holdfast.numerics.steady_state import SteadyState, steady_state
 from holdfast.parts import Plant
 from holdfast.plants.linear import LinearPlant
 
@@ -49,7 +49,7 @@ def analysis(plant: Plant, x0: np.ndarray, P0: np.ndarray) -> Analysis:
     return Analysis(
         model,
         observability(model),
-        steady_state(model),
+        steady_state(model.A, model.C, model.Q, model.R),
         attacks,
         tuple(bounds(model, P0, delay) for delay in delays),
         window,

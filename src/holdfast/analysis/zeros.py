@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from holdfast.analysis.model import Model
-from holdfast.analysis.observability import UNSTABLE
-from holdfast.analysis.subspaces import (
+from holdfast.numerics.steady_state import UNSTABLE
+from holdfast.numerics.subspaces import (
     TOLERANCE,
     Scaled,
     complement,
