@@ -5,6 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from holdfast.analysis.attacks import Channel
+from holdfast.analysis.fusion import CERTAIN, Fusion
 from holdfast.analysis.whole import Analysis
 from holdfast.analysis.zeros import Zero
 
@@ -12,8 +13,11 @@ SHOWN = 3
 """Names that a sentence lists."""
 
 
-def advice(found: Analysis, delay: int | None) -> list[str]:
-    """The sentences, most basic first; ``delay`` is the estimator's, None where it has none."""
+def advice(found: Analysis, delay: int | None, fusion: bool = False) -> list[str]:
+    """The sentences, most basic first; ``delay`` is the estimator's, None where it has none.
+
+    ``fusion``: whether to say what the fusion of local estimates withstands.
+    """
     said = [f"This holds for {found.model.note}."] if found.model.note else []
     said += _on_state(found)
     for channel in found.attacks.channels:
@@ -22,6 +26,8 @@ def advice(found: Analysis, delay: int | None) -> list[str]:
     said += _on_delay(found, delay)
     said += _on_bounds(found)
     said += _on_window(found)
+    if fusion:
+        said += _on_fusion(found.fusion)
     return said
 
 
@@ -127,6 +133,72 @@ def _on_window(found: Analysis) -> list[str]:
         if count:
             said.append(f"{name} is not determined by its own row at {count} of {window.steps}.")
     return said
+
+
+def _on_fusion(found: Fusion) -> list[str]:
+    if found.reason is not None:
+        return [f"What the LASSO fusion withstands cannot be said: {found.reason}."]
+    said = _on_liars(found)
+    if found.withstood:
+        who = "one sensor" if found.withstood == 1 else f"{found.withstood} sensors at once"
+        at = found.withstood - 1
+        worst = between(float(found.lower_sets[at]), float(found.upper_sets[at]))
+        said.append(
+            f"The LASSO fusion withstands any {who} of the {len(found.sensors)}: the worst "
+            f"ratio is {worst}, under 1."
+        )
+    else:
+        said += _on_remedies(found)
+    if found.ill_conditioned:
+        said.append(
+            "The coordinates in which the LASSO fusion counts are ill-conditioned here "
+            f'({found.condition:.1g}): norm = "group" does not need them.'
+        )
+    return said
+
+
+def _on_liars(found: Fusion) -> list[str]:
+    lower, upper = found.lower.tolist(), found.upper.tolist()
+    order = sorted(range(len(upper)), key=lambda i: -upper[i])
+    shown = {i: f'"{found.sensors[i]}" (ratio {between(lower[i], upper[i])})' for i in order}
+    heavy = [shown[i] for i in order if lower[i] >= CERTAIN]
+    unsure = [shown[i] for i in order if lower[i] < CERTAIN <= upper[i]]
+    said = []
+    if heavy:
+        said.append(
+            f"Under the LASSO fusion this plant cannot afford a lie of {_joined(heavy, 'or')}: "
+            "from a ratio of 1 a sensor can outweigh all others and be believed, however far "
+            "it lies."
+        )
+    if unsure:
+        said.append(f"Whether the LASSO fusion bounds a lie of {_listed(unsure)} is not known.")
+    return said
+
+
+def _on_remedies(found: Fusion) -> list[str]:
+    said = []
+    for remedies, text in (
+        (found.authenticate, "Authenticate {} and the LASSO fusion withstands any other sensor"),
+        (found.add, "Measure {} as well and the LASSO fusion withstands any one sensor"),
+    ):
+        names = [f'"{r.name}" (ratio {between(r.lower, r.upper)})' for r in remedies if r.enough]
+        if names:
+            said.append(f"{text.format(_joined(names, 'or'))}.")
+    if not said and found.untried:
+        said.append("What would mend that was too dear to try.")
+    elif not said:
+        said.append("No single sensor, authenticated or added, mends that.")
+    return said
+
+
+def between(lower: float, upper: float) -> str:
+    """A ratio that lies between two bounds."""
+    if lower == np.inf:
+        return "infinite"
+    if upper == np.inf:
+        return f"over {lower:.3g}"
+    ends = f"{lower:.3g}", f"{upper:.3g}"
+    return ends[0] if ends[0] == ends[1] else f"{ends[0]} to {ends[1]}"
 
 
 def combination(vector: np.ndarray, names: Iterable[str]) -> str:

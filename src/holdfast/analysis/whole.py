@@ -6,6 +6,7 @@ import numpy as np
 
 from holdfast.analysis.attacks import Identifiability, identifiability, undetermined_steps
 from holdfast.analysis.boundedness import Bounds, bounds
+from holdfast.analysis.fusion import Fusion, fusion
 from holdfast.analysis.model import Model, model_at, models_over
 from holdfast.analysis.observability import Observability, observability, rows_until_observable
 from holdfast.numerics.steady_state import SteadyState, steady_state
@@ -35,6 +36,7 @@ class Analysis(NamedTuple):
     attacks: Identifiability
     bounds: tuple[Bounds, ...]
     window: Window | None
+    fusion: Fusion
 
 
 def analysis(plant: Plant, x0: np.ndarray, P0: np.ndarray) -> Analysis:
@@ -42,6 +44,7 @@ def analysis(plant: Plant, x0: np.ndarray, P0: np.ndarray) -> Analysis:
     model = model_at(plant, x0)
     attacks = identifiability(model)
     delays = sorted({0, attacks.delay}) if model.attacks else []
+    steady = steady_state(model.A, model.C, model.Q, model.R)
     window = None
     if isinstance(plant, LinearPlant) and plant.steps is not None:
         models = models_over(plant, x0)
@@ -49,8 +52,9 @@ def analysis(plant: Plant, x0: np.ndarray, P0: np.ndarray) -> Analysis:
     return Analysis(
         model,
         observability(model),
-        steady_state(model.A, model.C, model.Q, model.R),
+        steady,
         attacks,
         tuple(bounds(model, P0, delay) for delay in delays),
         window,
+        fusion(model, steady),
     )

@@ -8,16 +8,17 @@ the same poles to the pair (J, 1) of the paper.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import schur
+from scipy.linalg import matrix_balance, schur
 
 from holdfast.numerics.subspaces import NEAR
 
 TOGETHER = 1e-6
 """Relative distance within which eigenvalues with a deficient eigenspace are one block."""
 DEFICIENT = 1e-8
-"""Singular value of a nilpotent part, relative to its size, that counts as zero."""
-ROUNDING = 1e-13
-"""The same where only rounding can have scattered eigenvalues further than `TOGETHER`."""
+"""Singular value of a nilpotent part, relative to its size, that counts as zero for these."""
+ROUNDING = 1e-12
+"""The same for eigenvalues further apart, and for several blocks of one eigenvalue: there only
+rounding may have scattered them, since their mean stands for all."""
 
 
 class Block(NamedTuple):
@@ -36,49 +37,66 @@ def blocks(M: np.ndarray) -> list[Block]:
     """The Jordan structure of a real M (n x n), largest eigenvalue first.
 
     Eigenvalues within `TOGETHER` of each other whose eigenspace is deficient are one
-    eigenvalue, their mean; others are taken as they are, however close.
+    eigenvalue, their mean; others are taken as they are, however close. The units of the
+    state make no difference (up to powers of 2, which balancing takes).
     """
+    M = matrix_balance(M, permute=False)[0]
+    computed = np.diag(schur(M, output="complex")[0])
     left = [complex(z) for z in np.linalg.eigvals(M)]
     found = []
     while left:
-        group, value, sizes = _group(M, left)
+        group, value, sizes = _group(M, computed, left)
+        for z in group:
+            left.remove(z)
         # a real eigenvalue's scatter may have imaginary parts, a complex one's conjugates are
         # another group
-        left = [z for z in left if z not in group]
         if value.imag >= 0:
             found.append(Block(value, sizes, tuple(group)))
     return sorted(found, key=lambda b: (-abs(b.value), -b.value.real, b.value.imag))
 
 
-def _group(M, left: list[complex]) -> tuple[list[complex], complex, tuple[int, ...]]:
+def _group(M, computed, left: list[complex]) -> tuple[list[complex], complex, tuple[int, ...]]:
     first = left[0]
     scale = max(float(np.linalg.norm(M, 2)), np.finfo(float).tiny)
     for distance in NEAR:
-        group = [z for z in left if abs(z - first) <= distance * max(abs(z), abs(first))]
+        group = [z for z in left if abs(z - first) <= distance * scale]
         if len(group) == 1:
             break
         value = complex(np.mean(group))
         spread = max(abs(z - value) for z in group)
         if abs(value.imag) <= spread:
+            if any(z.conjugate() not in group for z in group):
+                continue
             value = complex(value.real)
-        limit = DEFICIENT if spread <= TOGETHER * abs(value) else ROUNDING
-        sizes = _sizes(M, group, value, limit * scale)
+        nilpotent = _nilpotent(M, computed, value, len(group))
+        sizes = _sizes(nilpotent, ROUNDING * scale)
+        if sizes is None and spread <= TOGETHER * abs(value):
+            sizes = _sizes(nilpotent, DEFICIENT * scale)
+            if sizes is not None and len(sizes) > 1:
+                continue
         if sizes is not None:
             return group, value, sizes
     return [first], first, (1,)
 
 
-def _sizes(M, group: list[complex], value: complex, limit: float) -> tuple[int, ...] | None:
-    """The block sizes of M - value I on the invariant subspace of a group; None if it is regular.
+def _nilpotent(M, computed, value: complex, k: int) -> np.ndarray:
+    """M - value I on the invariant subspace of the k eigenvalues nearest to ``value``.
+
+    ``computed``: the eigenvalues as the factorisation finds them, which scatters them
+    differently from one that balances or keeps conjugates exact.
+    """
+    away = np.append(np.sort(np.abs(computed - value)), np.inf)
+    reach = (away[k - 1] + away[k]) / 2
+    triangle = schur(M, output="complex", sort=lambda z: bool(abs(z - value) < reach))[0]
+    return triangle[:k, :k] - value * np.eye(k)
+
+
+def _sizes(nilpotent: np.ndarray, limit: float) -> tuple[int, ...] | None:
+    """The block sizes of a nilpotent matrix; None if it is not nilpotent.
 
     From the ranks of its powers (the Weyr characteristic).
     """
-    reach = 2.0 * max(abs(z - value) for z in group) + 1e-14 * abs(value)
-    triangle, _, count = schur(M, output="complex", sort=lambda z: bool(abs(z - value) <= reach))
-    k = len(group)
-    if count != k:
-        return None
-    nilpotent = triangle[:k, :k] - value * np.eye(k)
+    k = len(nilpotent)
     size = max(1.0, float(np.linalg.norm(nilpotent, 2)))
     power, nullities = np.eye(k), [0]
     for j in range(1, k + 1):

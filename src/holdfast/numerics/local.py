@@ -71,7 +71,8 @@ def decompose(A: np.ndarray, C: np.ndarray, Q: np.ndarray, R: np.ndarray, K: np.
     """The decomposition of the filter with the gain ``K`` (n x m).
 
     A (n x n), C (m x n), Q (n x n), R (m x m) full. Raises `Unfit` where A - K C A is not
-    stable or shares an eigenvalue with A.
+    stable or shares an eigenvalue with A, to the digits that sum F_i G_i = I shows (a repeated
+    eigenvalue is shared without any two computed ones being close).
     """
     n, m = K.shape
     M = A - K @ C @ A
@@ -84,12 +85,11 @@ def decompose(A: np.ndarray, C: np.ndarray, Q: np.ndarray, R: np.ndarray, K: np.
     enters = (G - np.einsum("d,in->idn", b, C)).reshape(m * d, n)
     noise = enters @ Q @ enters.T + np.kron(R, np.outer(b, b))
     W = bank_covariance(S, noise)
+    F, G = np.concatenate(F, 1), G.reshape(m * d, n)
+    _check_sum(F, G)
     left = np.eye(n) - K @ C
     P = stein(M, M, (left @ Q @ left.T + K @ R @ K.T)[None])[0]
-    return Local(
-        S, b, np.concatenate(F, 1), G.reshape(m * d, n), W, (P + P.T) / 2,
-        coordinates(S, b, found), tuple(found),
-    )  # fmt: skip
+    return Local(S, b, F, G, W, (P + P.T) / 2, coordinates(S, b, found), tuple(found))
 
 
 def _check(A: np.ndarray, M: np.ndarray) -> None:
@@ -105,6 +105,18 @@ def _check(A: np.ndarray, M: np.ndarray) -> None:
         raise Unfit(
             f"A and A - K C A share the eigenvalue {text}: no measurement corrects that mode "
             "(it is not seen, not excited by noise, or forgotten in one step)"
+        )
+
+
+def _check_sum(F: np.ndarray, G: np.ndarray) -> None:
+    """Sum F_i G_i = I, with each state in the unit in which the local estimates see it."""
+    size = np.linalg.norm(G, axis=0)
+    unit = 1.0 / np.where(size > 0, size, 1.0)
+    lost = np.max(np.abs(F @ G - np.eye(len(unit))) * unit / unit[:, None])
+    if not lost <= SHARED:
+        raise Unfit(
+            "A and A - K C A come too close to sharing an eigenvalue: the local estimates give "
+            f"the state back with a relative error of {lost:.1g}"
         )
 
 

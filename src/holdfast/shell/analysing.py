@@ -7,13 +7,19 @@ import numpy as np
 import rich.console
 import rich.table
 
-from holdfast.analysis.advice import advice
+from holdfast.analysis.advice import advice, between
+from holdfast.analysis.fusion import Fusion, Remedy
 from holdfast.analysis.whole import Analysis, analysis
 from holdfast.analysis.zeros import Zero
 from holdfast.loop import Scenario
 from holdfast.shell import runtime
 from holdfast.shell.calibrating import busy
 from holdfast.shell.scenario import read_scenario
+
+FUSING = ("decomposition", "secure_fusion")
+"""Estimators that fuse local estimates."""
+KNOWN = 1e-5
+"""Relative distance of two bounds that are given as one number."""
 
 
 def analyse(scenario: str, as_json: bool, allow_python: bool) -> None:
@@ -23,11 +29,12 @@ def analyse(scenario: str, as_json: bool, allow_python: bool) -> None:
     x0, P0 = _start(found)
     with busy("analysing the plant"):
         result = analysis(found.plant, x0, P0)
-    sentences = advice(result, getattr(found.monitor.estimator, "delay", None))
+    sensors_lie = _sensors_lie(found)
+    sentences = advice(result, getattr(found.monitor.estimator, "delay", None), sensors_lie)
     if as_json:
         print(json.dumps(content(result, sentences), allow_nan=False, indent=1))
     else:
-        _print(result, sentences)
+        _print(result, sentences, sensors_lie)
 
 
 def _start(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
@@ -36,6 +43,12 @@ def _start(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     x0 = getattr(estimator, "x0", scenario.x0)
     P0 = getattr(estimator, "P0", np.eye(len(scenario.plant.states)))
     return np.asarray(x0, float), np.asarray(P0, float)
+
+
+def _sensors_lie(scenario: Scenario) -> bool:
+    """Whether fusion is what the scenario is about: by its estimator, or for want of channels."""
+    kind = type(scenario.monitor.estimator).__module__.rpartition(".")[2]
+    return kind in FUSING or not scenario.plant.attacks
 
 
 def content(found: Analysis, sentences: list[str]) -> dict[str, Any]:
@@ -55,6 +68,7 @@ def content(found: Analysis, sentences: list[str]) -> dict[str, Any]:
         },
         "attacks": _attacks(found),
         "window": None if window is None else window._asdict(),
+        "fusion": _fusion(found.fusion),
         "of": found.model.note or None,
         "advice": sentences,
     }
@@ -82,6 +96,41 @@ def _attacks(found: Analysis) -> dict[str, Any]:
     }
 
 
+def _fusion(found: Fusion) -> dict[str, Any]:
+    by_name = [dict(zip(found.sensors, v.tolist(), strict=True)) for v in found[2:4]]
+    by_count = [{str(p): x for p, x in enumerate(v.tolist(), 1)} for v in found[4:6]]
+    return {
+        "ratio": {name: _ratio(by_name[0][name], by_name[1][name]) for name in found.sensors},
+        "lower": _finite(by_name[0]),
+        "upper": _finite(by_name[1]),
+        "bounded": dict(zip(found.sensors, found.bounded, strict=True)),
+        "all_p": {p: _ratio(by_count[0][p], by_count[1][p]) for p in by_count[0]},
+        "all_p_bounds": {"lower": _finite(by_count[0]), "upper": _finite(by_count[1])},
+        "withstood": found.withstood,
+        "sparse_observable": found.sparse_observable,
+        "authenticate": [_remedy(remedy) for remedy in found.authenticate],
+        "add": [_remedy(remedy) for remedy in found.add],
+        "untried": found.untried,
+        "condition": found.condition,
+        "derogatory": found.derogatory,
+        "reason": found.reason,
+    }
+
+
+def _remedy(remedy: Remedy) -> dict[str, Any]:
+    bounds = _finite({"lower": remedy.lower, "upper": remedy.upper})
+    ratio = _ratio(remedy.lower, remedy.upper)
+    return {"name": remedy.name, "ratio": ratio, **bounds, "enough": remedy.enough}
+
+
+def _ratio(lower: float, upper: float) -> float | None:
+    return lower if upper < np.inf and upper - lower <= KNOWN * upper else None
+
+
+def _finite(values: dict[str, float]) -> dict[str, float | None]:
+    return {name: value if np.isfinite(value) else None for name, value in values.items()}
+
+
 def _zero(zero: Zero, found: Analysis) -> dict[str, Any]:
     model = found.model
     return {
@@ -106,7 +155,7 @@ def _pair(value: complex) -> list[float]:
     return [value.real + 0.0, value.imag + 0.0]
 
 
-def _print(found: Analysis, sentences: list[str]) -> None:
+def _print(found: Analysis, sentences: list[str], sensors_lie: bool) -> None:
     console = rich.console.Console()
     table = rich.table.Table(show_header=False, box=None, pad_edge=False)
     for name, text in _rows(found):
@@ -114,6 +163,8 @@ def _print(found: Analysis, sentences: list[str]) -> None:
     console.print(table)
     if found.attacks.channels:
         console.print(_channels(found))
+    if sensors_lie and found.fusion.sensors:
+        console.print(_liars(found.fusion))
     for sentence in sentences:
         console.print(f"- {sentence}", markup=False, highlight=False, soft_wrap=True)
 
@@ -152,6 +203,17 @@ def _channels(found: Analysis) -> rich.table.Table:
             "never" if never else str(channel.delay),
             "-" if never else words[last.attack[channel.name]],
         )
+    return table
+
+
+def _liars(found: Fusion) -> rich.table.Table:
+    table = rich.table.Table(box=None, pad_edge=False)
+    for heading in ("sensor", "worst ratio", "bounded under a lie"):
+        table.add_column(heading)
+    for name, lower, upper, bounded in zip(
+        found.sensors, found.lower, found.upper, found.bounded, strict=True
+    ):
+        table.add_row(name, between(lower, upper), "yes" if bounded else "no")
     return table
 
 
