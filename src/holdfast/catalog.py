@@ -17,7 +17,15 @@ from holdfast.detectors import (
     sprt,
     windowed,
 )
-from holdfast.estimators import care, extended, kalman, unknown_input, unscented
+from holdfast.estimators import (
+    care,
+    decomposition,
+    extended,
+    kalman,
+    secure_fusion,
+    unknown_input,
+    unscented,
+)
 from holdfast.plants import build
 from holdfast.plants.library import bicycle, uav
 
@@ -35,6 +43,8 @@ ESTIMATORS: Builders = {
     "care": care.build,
     "extended": extended.build,
     "unscented": unscented.build,
+    "decomposition": decomposition.build,
+    "secure_fusion": secure_fusion.build,
 }
 
 DETECTORS: Builders = {

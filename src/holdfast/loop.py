@@ -75,6 +75,8 @@ def monitor_step(
             estimate.status | jnp.where(ok, 0, int(Status.DIVERGED)),
         ),
     )
+    if estimate.a is not None:
+        estimate = eqx.tree_at(lambda e: e.a, estimate, _finite_or_zero(estimate.a))
     judged, verdict = monitor.detector.step(judged, estimate)
     return (after, judged), (estimate, verdict)
 

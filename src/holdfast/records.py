@@ -151,7 +151,8 @@ class Estimate(eqx.Module):
     per attack channel of the plant; ``d_free``, ``d_free_cov``: the same before any
     projection, which is what a sound test needs. ``d_rows``, ``d_bound``: the attack's
     constraint set ``d_rows d <= d_bound`` at this step. ``residual``, ``residual_cov``: the
-    innovation; an unknown-input filter's is blind to the attack by construction.
+    innovation; an unknown-input filter's is blind to the attack by construction. ``a``: what
+    each sensor's sample is off by, 0 where it is believed, from estimators that say so.
 
     Conventions of the covariances: a diagonal of ``inf`` marks a quantity that the data do
     not determine (its covariances are 0, and an attack's value too), a diagonal of 0 in
@@ -169,15 +170,16 @@ class Estimate(eqx.Module):
     residual: Float[Array, "*t ny"]
     residual_cov: Float[Array, "*t ny ny"]
     status: Int[Array, "*t"]
+    a: Float[Array, "*t ny"] | None = None
 
     @classmethod
-    def without_attack(cls, x, x_cov, residual, residual_cov, status) -> "Estimate":
-        """The record of an estimator that estimates no attack."""
+    def without_attack(cls, x, x_cov, residual, residual_cov, status, a=None) -> "Estimate":
+        """The record of an estimator that estimates no attack on the plant's channels."""
         none = jnp.zeros((0,))
         square = jnp.zeros((0, 0))
         return cls(
             x, x_cov, none, square, none, square, square, none, residual, residual_cov,
-            jnp.asarray(status, jnp.int32),
+            jnp.asarray(status, jnp.int32), a,
         )  # fmt: skip
 
 

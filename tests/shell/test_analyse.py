@@ -47,6 +47,65 @@ def test_json_has_what_others_rely_on(folder, command):
     assert all(math.isfinite(number) for number in numbers(found))
 
 
+PAPER = """\
+[plant]
+kind = "linear"
+dt = 1.0
+A = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -2.0]]
+C = [[1.0, 0.0, 0.0], [1.0, 1.0, -1.0], [1.0, 2.0, 1.0], [1.0, -1.0, -0.5], [-0.5, 1.0, 1.0]]
+Q = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+R = [[1.0, 0, 0, 0, 0], [0, 1.0, 0, 0, 0], [0, 0, 1.0, 0, 0], [0, 0, 0, 1.0, 0], [0, 0, 0, 0, 1.0]]
+
+[estimator]
+kind = "kalman"
+x0 = [0.0, 0.0, 0.0]
+P0 = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+
+[detector]
+kind = "chi_square"
+on = "residual"
+"""
+
+
+def test_fusion_of_the_paper_s_example(folder, command):
+    (folder / "paper.toml").write_text(PAPER)
+    found = analysed(command, folder / "paper.toml")
+    fusion = found["fusion"]
+    assert set(fusion) == {
+        "ratio", "lower", "upper", "bounded", "all_p", "all_p_bounds", "withstood", "untried",
+        "sparse_observable", "authenticate", "add", "condition", "derogatory", "reason",
+    }  # fmt: skip
+    ratio = {"y1": 0.4305, "y2": 1.6873, "y3": 1.1460, "y4": 0.7579, "y5": 0.4379}
+    assert fusion["ratio"] == pytest.approx(ratio, abs=5e-5)
+    assert fusion["ratio"] == fusion["lower"] == fusion["upper"]
+    assert fusion["bounded"] == {name: value < 1 for name, value in ratio.items()}
+    assert fusion["all_p"] == pytest.approx({"1": 1.6873, "2": 6.265}, abs=5e-5)
+    assert fusion["all_p"] == fusion["all_p_bounds"]["lower"] == fusion["all_p_bounds"]["upper"]
+    assert (fusion["withstood"], fusion["sparse_observable"], fusion["reason"]) == (0, 1, None)
+    best = fusion["authenticate"][0]
+    assert (best["name"], best["enough"], best["ratio"]) == ("y2", True, best["upper"])
+    assert [remedy["name"] for remedy in fusion["add"]] == ["x3", "x2", "x1"]
+    # the plant has no attack channel: it is its sensors that may lie
+    assert found["advice"][0].startswith("Under the LASSO fusion this plant cannot afford a lie")
+    _, out, _ = command("analyse", folder / "paper.toml")
+    assert re.search(r"sensor +worst ratio +bounded under a lie", out)
+    assert re.search(r"y1 +0.431 +yes", out)
+    assert re.search(r"y2 +1.69 +no", out)
+
+
+def test_an_infinite_ratio_is_null(folder, command):
+    """Each state has one sensor."""
+    text = SCENARIO.replace("A = [[1.0, 0.1], [0.0, 1.0]]", "A = [[0.9, 0.0], [0.0, 0.9]]")
+    (folder / "alone.toml").write_text(text)
+    found = analysed(command, folder / "alone.toml")
+    fusion = found["fusion"]
+    assert fusion["ratio"] == fusion["lower"] == fusion["upper"] == {"gps": None, "wheel": None}
+    assert fusion["bounded"] == {"gps": False, "wheel": False}
+    assert fusion["all_p"] == {"1": None}
+    # its attack channel is what this scenario is about
+    assert not any("LASSO" in sentence for sentence in found["advice"])
+
+
 def test_null_where_there_is_none(folder, command):
     """Only the speed is measured: the position is not observable."""
     text = SCENARIO.replace("C = [[1.0, 0.0], [0.0, 1.0]]", "C = [[0.0, 1.0]]")
@@ -58,6 +117,8 @@ def test_null_where_there_is_none(folder, command):
     assert found["unobserved"] == [{"position": 1.0, "speed": 0.0}]
     assert [found["steady_state"][name] for name in ("K", "P", "P_pred")] == [None] * 3
     assert "unstable mode 1" in found["steady_state"]["reason"]
+    assert (found["fusion"]["ratio"], found["fusion"]["withstood"]) == ({}, None)
+    assert "one sensor" in found["fusion"]["reason"]
     assert any('measure "position"' in sentence for sentence in found["advice"])
 
 

@@ -225,9 +225,12 @@ def _pivot(slabs: _Slabs, s: _Working) -> _Working:
 
     # an added row leaves the others what is orthogonal to it, a dropped one gives its part back
     along = pick(table, chosen)
+    # near dependent rows leave next to nothing but rounding: it is taken off once more
+    strays = jnp.where(active, dot_rows(slabs.normal, along[None]) - chosen, 0.0)
+    along = along - total(strays[:, None] * table)
+    across = dot_rows(slabs.normal, along[None])
     square = total(along * along)
     inverse = jnp.where(moves, 1.0, 0.0) / jnp.where(square > 0, square, 1.0)
-    across = dot_rows(slabs.normal, along[None])
     of_active = jnp.where(adding, toward, dot_rows(table, along[None]))
     change = jnp.where(active, of_active, jnp.where(adding, across, -across)) * inverse
     push = jnp.where(adding, sign * height, pick(s.weight, chosen))

@@ -18,6 +18,10 @@ ROUNDS = 200
 """Changes of the weights of a certificate, at most."""
 FEW = 60
 """The same, where a certificate is no longer good."""
+NORM = 30.0
+"""Multiplications that take as long as the norm of a 2 x 2 matrix."""
+OVERHEAD = 1e5
+"""Multiplications that take as long as what comes with every round."""
 STEPS = 40
 """Steps of an ascent."""
 KINK = 1e-10
@@ -127,61 +131,62 @@ def climb(part: Component, U: np.ndarray, choose: Callable, rounds: int) -> np.n
     return U
 
 
-def alone(i: int) -> Callable:
-    """For `climb`: block i."""
-    return lambda g: np.tile(np.arange(g.shape[1]) == i, (len(g), 1))
+def fixed(sets: np.ndarray) -> Callable:
+    """For `climb`: these blocks, a row of ``sets`` (k x m, bool) for each row of U."""
+    return lambda g: sets
 
 
-def top(count: int) -> Callable:
-    """For `climb`: the ``count`` largest blocks."""
-
-    def choose(g):
-        order = np.argsort(-g, 1)[:, :count]
-        return np.any(order[:, :, None] == np.arange(g.shape[1]), 1)
-
-    return choose
+def top(count: np.ndarray) -> Callable:
+    """For `climb`: the ``count`` (k,) largest blocks."""
+    return lambda g: np.argsort(np.argsort(-g, 1), 1) < count[:, None]
 
 
 def effort(part: Component) -> float:
     """Multiplications of one round of certificates, one for each block, about."""
     N, _, r = part.parts.shape
-    return 4.0 * r * N * (r * len(np.unique(part.block)) + N)
+    blocks = len(np.unique(part.block))
+    return N * (4.0 * r * r * blocks + (4.0 * r + NORM) * N) + OVERHEAD * blocks
 
 
 def bounded(part: Component, most: int, work: float) -> Ratios:
     """An interval for each block alone and for the worst sets of up to ``most`` blocks.
 
-    ``work``: multiplications that the certificates of the blocks may take, about, and
-    those of the sets, and the ascents.
+    ``work``: multiplications that the certificates of the blocks may take, about, those of
+    the sets, and the ascents.
     """
     m, (N, _, r) = part.blocks, part.parts.shape
-    starts = int(np.clip(work / (STEPS * m * 2 * N * r * r), 1, 3 * r))
-    rounds = int(np.clip(work / effort(part), 5, ROUNDS))
-    best = np.array([_climbed(part, i, starts) for i in range(m)])
+    step = STEPS * 2.0 * N * r * (r + NORM / 2)
+    best = _climbed(part, int(np.clip(work / (step * m), 1, 3 * r)))
     g = part.sums(best)
     lower = np.diagonal(single(g))
+    rounds = int(np.clip(work / effort(part), 5, ROUNDS))
     upper = np.maximum([_certified_alone(part, part.block == i, rounds) for i in range(m)], lower)
-    ends = [g]
-    for p in range(2, most + 1):
-        near = best[np.argsort(-largest(g, p)[:, -1])[:starts]]
-        ends.append(part.sums(climb(part, near, top(p), STEPS)))
-    lower_sets = np.max([np.max(largest(g, most), 0) for g in ends], 0)
-    rounds = int(np.clip(work / (most * 4.0 * r * N * (r + N)), 5, ROUNDS))
-    upper_sets = np.maximum(_certified_sets(part, upper, most, rounds), lower_sets)
+    if most > 1:
+        starts = int(np.clip(work / (step * most), 1, m))
+        order = np.argsort(-largest(g, most)[:, 1:], 0)[:starts]
+        count = np.repeat(np.arange(2, most + 1), starts)
+        ends = climb(part, best[order.T.ravel()], top(count), STEPS)
+        g = np.concatenate([g, part.sums(ends)])
+    lower_sets = np.max(largest(g, most), 0)
+    upper_sets = np.maximum(_certified_sets(part, upper, most, work), lower_sets)
     return Ratios(lower, upper, lower_sets, upper_sets)
 
 
-def _climbed(part: Component, i: int, starts: int) -> np.ndarray:
-    """The best u found for block i, started from what it sees best and from sums of its rows."""
-    rows = part.parts[part.block == i].reshape(-1, part.parts.shape[2])
-    if not len(rows):
-        return np.zeros(part.parts.shape[2])
-    seen = np.linalg.svd(rows)[2]
-    # no randomness is needed: the cosines of squares are spread well enough
-    mixed = np.cos(np.arange(2 * rows.size) ** 2.0).reshape(-1, len(rows)) @ rows
-    first = np.concatenate([seen[:1], mixed[: len(seen)], seen[1:], mixed[len(seen) :]])[:starts]
-    U = np.concatenate([first, climb(part, first, alone(i), STEPS)])
-    return U[np.argmax(single(part.sums(U))[:, i])]
+def _climbed(part: Component, starts: int) -> np.ndarray:
+    """The best u found for each block, from what it sees best and from sums of its rows."""
+    m, r = part.blocks, part.parts.shape[2]
+    first, whose = [np.zeros((0, r))], []
+    for i in np.unique(part.block):
+        rows = part.parts[part.block == i].reshape(-1, r)
+        seen = np.linalg.svd(rows)[2]
+        # no randomness is needed: the cosines of squares are spread well enough
+        mixed = np.cos(np.arange(2 * r * len(rows)) ** 2.0).reshape(2 * r, -1) @ rows
+        first.append(np.concatenate([seen[:1], mixed[:r], seen[1:], mixed[r:]])[:starts])
+        whose += [i] * len(first[-1])
+    U, own = np.concatenate(first), np.array(whose, int)
+    U = np.concatenate([U, climb(part, U, fixed(np.arange(m) == own[:, None]), STEPS)])
+    ratio = np.where(np.arange(m) == np.tile(own, 2)[:, None], single(part.sums(U)), -1.0)
+    return U[np.argmax(ratio, 0)]
 
 
 def _certified_alone(part: Component, own: np.ndarray, rounds: int) -> float:
@@ -189,13 +194,15 @@ def _certified_alone(part: Component, own: np.ndarray, rounds: int) -> float:
     return _certified(part.parts[own], part.parts[~own], one, 1, rounds) if own.any() else 0.0
 
 
-def _certified_sets(part: Component, upper: np.ndarray, most: int, rounds: int) -> np.ndarray:
+def _certified_sets(part: Component, upper: np.ndarray, most: int, work: float) -> np.ndarray:
     """For the worst sets: from the bounds of the blocks alone, and from all rows at once."""
     finite = np.where(np.isinf(upper), 0.0, upper)
     shares = np.where(np.isinf(upper), 1.0, finite / (1.0 + finite))
     share = np.cumsum(-np.sort(-shares))[:most]
-    member = part.member.astype(float)
-    for p in range(2, most + 1):
+    member, (N, _, r) = part.member.astype(float), part.parts.shape
+    cost = N * (4.0 * r * r + (4.0 * r + NORM) * N) + OVERHEAD
+    rounds = int(np.clip(work / (cost * most), FEW, ROUNDS))
+    for p in range(2, min(most, 1 + int(work / (cost * rounds))) + 1):
         at_once = _certified(part.parts, part.parts, member, p, rounds)
         share[p - 1] = min(share[p - 1], at_once)
         if share[p - 1] >= 1.0:

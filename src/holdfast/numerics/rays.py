@@ -29,10 +29,10 @@ from holdfast.numerics.ratio_bounds import (
     STEPS,
     Component,
     Ratios,
-    alone,
     bounded,
     climb,
     effort,
+    fixed,
     largest,
     single,
     top,
@@ -45,6 +45,8 @@ DIRECTIONS = (1024, 256, 64, 32, 16, 12, 8, 6, 4)
 """Numbers of directions of a pair; the ratio is then known to a factor 1 / cos(pi / 2K)."""
 WORK = 10.0
 """Multiplications of a certificate that take as long as a row of a ray."""
+NEAR = 1.0 - 1e-4
+"""Factor from which the best ray is not improved upon."""
 NOTHING = 1e-12
 """Relative size that counts as zero."""
 PARALLEL = 1e-9
@@ -176,7 +178,7 @@ def _cost(rows: np.ndarray) -> float:
 
 
 def _best(part: Component, rows, weights: np.ndarray, most: int, factor: float) -> Ratios:
-    """The best of all rays, where |rows u| weights is between ``factor`` times the sums and them."""
+    """The best of all rays, where |rows u| weights is from ``factor`` to once the sums."""
     m, r = part.blocks, rows.shape[1]
     share, where = np.full(m + most, -1.0), np.zeros((m + most, r))
     for U in _rays(rows):
@@ -193,11 +195,11 @@ def _best(part: Component, rows, weights: np.ndarray, most: int, factor: float) 
         return Ratios(lower[:m], lower[:m], lower[m:], lower[m:])
     g = np.abs(where @ rows.T) @ weights
     upper = np.append(np.diagonal(single(g)[:m]), np.diagonal(largest(g, most)[m:])) / factor
-    better = np.concatenate(
-        [climb(part, where[[i]], alone(i), STEPS) for i in range(m)]
-        + [climb(part, where[[m + p]], top(p + 1), STEPS) for p in range(most)]
-    )
-    lower = np.maximum(_values(part, where, most), _values(part, better, most))
+    lower = _values(part, where, most)
+    if factor < NEAR:
+        own = climb(part, where[:m], fixed(np.eye(m, dtype=bool)), STEPS)
+        sets = climb(part, where[m:], top(np.arange(1, most + 1)), STEPS)
+        lower = np.maximum(lower, _values(part, np.concatenate([own, sets]), most))
     upper = np.maximum(upper, lower)
     return Ratios(lower[:m], upper[:m], lower[m:], upper[m:])
 

@@ -61,6 +61,8 @@ def dataset(
             value, cov = getattr(estimate, name), np.asarray(getattr(estimate, f"{name}_cov"))
             put(name, axes[:1], _where_finite(value, cov), text)
             put(f"{name}_cov", axes, cov, f"error covariance of {name}; inf = not determined")
+    if estimate.a is not None:
+        put("sensor_attack", ("output",), estimate.a, "what a suspected sensor's sample is off by")
     residual_cov = np.asarray(estimate.residual_cov)
     put("residual", ("output",), _where_information(estimate.residual, residual_cov),
         "innovation; NaN where the output carried no information")  # fmt: skip

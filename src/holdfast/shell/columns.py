@@ -9,7 +9,7 @@ import numpy as np
 from holdfast.parts import Plant
 from holdfast.shell.errors import InputError, did_you_mean, one_of
 
-RESULT_PREFIXES = frozenset({"x", "x_sd", "d", "d_sd", "alarm", "p"})
+RESULT_PREFIXES = frozenset({"x", "x_sd", "d", "d_sd", "a", "alarm", "p"})
 
 Column = tuple[np.ndarray, np.ndarray]
 """One number per row, and whether it arrived."""

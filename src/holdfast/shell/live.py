@@ -61,8 +61,8 @@ class Live:
         self._step = jax.jit(step, donate_argnums=0)
         self._start = np.concatenate([np.zeros(self._size), np.asarray(_pack(state))])
         split = len(jax.tree.leaves(outcome[0]))
-        self._estimate = _reader(Estimate, outcome_slots[:split])
-        self._verdict = _reader(Verdict, outcome_slots[split:])
+        self._estimate = _reader(outcome[0], outcome_slots[:split])
+        self._verdict = _reader(outcome[1], outcome_slots[split:])
         self.reset()
         self.push(Observation.of(np.zeros(self._nu), np.zeros(self._ny)))  # compiles
         self.reset()
@@ -146,12 +146,14 @@ def _unpack(flat: jax.Array, slots: list[_Slot], tree: Any) -> Any:
     return jax.tree.unflatten(tree, leaves)
 
 
-def _reader(kind: type[T], slots: list[_Slot]) -> Callable[[np.ndarray], T]:
-    """What makes a record of the flat result: views of it, counters and flags converted.
+def _reader(record: T, slots: list[_Slot]) -> Callable[[np.ndarray], T]:
+    """What makes such a record of the flat result: views of it, counters and flags converted.
 
     Built without the constructor's checks, which would cost more than the filter.
     """
-    names = list(kind.__dataclass_fields__)  # type: ignore[attr-defined]
+    kind = type(record)
+    every = list(kind.__dataclass_fields__)  # type: ignore[attr-defined]
+    names = [name for name in every if getattr(record, name) is not None]
     always: dict[str, Any] = {}
     vectors, matrices, scalars = [], [], []
     for name, (start, stop, shape, dtype) in zip(names, slots, strict=True):
@@ -165,7 +167,7 @@ def _reader(kind: type[T], slots: list[_Slot]) -> Callable[[np.ndarray], T]:
             matrices.append((name, slice(start, stop), shape))
 
     def read(values: np.ndarray) -> T:
-        fields = dict.fromkeys(names)
+        fields = dict.fromkeys(every)
         fields.update(always)
         for name, part, dtype in vectors:
             fields[name] = values[part].astype(dtype, copy=False)

@@ -60,6 +60,8 @@ def _columns(trace: Trace, plant: Plant, time: np.ndarray) -> dict[str, Column]:
     channels = plant.attacks[: d_sd.shape[1]]
     _add(columns, "d", channels, estimate.d, np.isinf(d_sd))
     _add(columns, "d_sd", channels, d_sd, np.isinf(d_sd))
+    if estimate.a is not None:
+        _add(columns, "a", plant.outputs, estimate.a, np.zeros(estimate.a.shape, bool))
     columns["statistic"] = (verdict.statistic, untested)
     columns["threshold"] = (verdict.threshold, untested)
     columns["alarm"] = (verdict.alarm.astype(int), never)
