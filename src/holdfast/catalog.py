@@ -27,7 +27,7 @@ from holdfast.estimators import (
     unscented,
 )
 from holdfast.plants import build
-from holdfast.plants.library import bicycle, uav
+from holdfast.plants.library import bicycle, five_sensors, uav
 
 Builders = dict[str, Callable[..., Any]]
 
@@ -35,6 +35,7 @@ PLANTS: Builders = {
     "linear": build.linear_plant,
     "uav": uav.build,
     "bicycle": bicycle.build,
+    "five_sensors": five_sensors.build,
 }
 
 ESTIMATORS: Builders = {

@@ -27,6 +27,7 @@ from holdfast.detectors.per_channel import PerChannel
 from holdfast.detectors.sprt import Sprt
 from holdfast.detectors.windowed import Windowed
 from holdfast.estimators.care import Care
+from holdfast.estimators.decomposition import Decomposition
 from holdfast.estimators.kalman import Kalman
 from holdfast.estimators.unknown_input import UnknownInput
 from holdfast.loop import Monitor, replay
@@ -139,6 +140,10 @@ def _exact(estimator: Estimator, detector: Calibratable) -> bool:
     plant = estimator.plant
     if detector.needs == "simulation" or getattr(detector, "projected", False):
         return False
+    if isinstance(estimator, Decomposition):
+        # each innovation has the covariance it says; one after the other they are white only
+        # once a Kalman gain has settled
+        return detector.needs not in ("white", "independent")
     if not (isinstance(estimator, Kalman | UnknownInput) and isinstance(plant, LinearPlant)):
         return False
     if plant.schedule is not None and plant.schedule[0] == "state":

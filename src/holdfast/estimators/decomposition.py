@@ -133,6 +133,8 @@ def fixed_gain(plant: LinearPlant, gain: Any, bound: float | None) -> np.ndarray
         if K.shape != C.T.shape:
             expected = f"{C.shape[1]} x {C.shape[0]}: x = x_pred + gain residual"
             raise InvalidValue("gain", " x ".join(map(str, K.shape)), expected)
+        if not np.all(np.isfinite(K)):
+            raise InvalidValue("gain", "NaN or infinity", "finite numbers")
         return K
     if bound is not None:
         K = h_infinity_gain(A, C, Q, R, bound) if bound > 0 else None

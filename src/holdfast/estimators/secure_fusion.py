@@ -23,19 +23,33 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy.special import chdtri
 
 from holdfast.estimators.decomposition import Bank, advance, expect, local_bank, start
-from holdfast.estimators.penalty import Chosen, Rule, begin, choose, costs, penalty, solve
+from holdfast.estimators.penalty import (
+    MANY,
+    RULES,
+    Chosen,
+    Rule,
+    begin,
+    choose,
+    costs,
+    penalty,
+    solve,
+)
 from holdfast.estimators.witness import Witness, WitnessState, witness
 from holdfast.numerics.lasso import Warm
-from holdfast.numerics.linalg import RANK_TOLERANCE, dot
+from holdfast.numerics.linalg import dot
 from holdfast.numerics.local import least_squares
+from holdfast.numerics.released import Released
 from holdfast.parts import Estimator, InvalidValue
 from holdfast.plants.linear import LinearPlant
 from holdfast.records import Estimate, Observation, Status
 
 ILL_CONDITIONED = 1e6
 """Condition of the paper's coordinates from which the l1 norm in them is warned of."""
+RELEASED = 0.01
+"""Share of rows in which an honest sensor would still be held under suspicion."""
 WRONG = 1e-9
 """Relative violation of the optimality conditions from which a row is NOT_CONVERGED."""
 
@@ -50,7 +64,8 @@ class Fusion(eqx.Module):
 
 class SecureFusionState(eqx.Module):
     """``f`` (m x d): the part of each local error that is put down to a lie, in the bank's
-    coordinates; ``size`` (m,): how large it is in standard deviations of that local error;
+    coordinates; ``size`` (m,): what it changes, in standard deviations of the sharpest test;
+    ``suspected`` (m,);
     ``residual``: the violation of the optimality conditions, ``pivots`` what the row took.
     """
 
@@ -61,6 +76,7 @@ class SecureFusionState(eqx.Module):
     witness: WitnessState | None
     f: Float[Array, "m d"]
     size: Float[Array, " m"]
+    suspected: Bool[Array, " m"]
     residual: Float[Array, ""]
     pivots: Int[Array, ""]
 
@@ -69,10 +85,10 @@ class SecureFusion(Estimator):
     """The fusion of the module. ``weight`` (g,) holds gamma; ``chosen`` says what it costs.
 
     The covariance is P + F_A (Z_A Z_A')^-1 F_A' and the square of the penalty's pull, A being the
-    columns with f != 0: right if the lies are among those. ``a`` of a row is the constant offset
-    of each suspected sensor that would explain its f without the penalty's pull. With ``refit``
-    the estimate is that of the other sensors, weighted anew. Where a sample is missing, W is
-    still that of complete data.
+    columns with f != 0: right if the lies are among those. ``a`` of a row is the sample of each
+    suspected sensor less what the others, weighted anew, say it should be. With ``refit`` the
+    estimate is that of the other sensors, weighted anew, as long as somebody is suspected. Where
+    a sample is missing, W is still that of complete data.
     """
 
     plant: LinearPlant
@@ -82,30 +98,34 @@ class SecureFusion(Estimator):
     P0: Float[Array, "n n"]
     weight: Float[Array, " g"]
     back: Float[Array, "N M"]
-    inflow: Float[Array, " d"]
-    scatter: Float[Array, "m d d"]
+    release: Float[Array, ""]
     witness: Witness | None
     group: tuple[int, ...] = eqx.field(static=True)
     kalman: bool = eqx.field(static=True)
-    suspect: float = eqx.field(static=True)
     refit: bool = eqx.field(static=True)
-    chosen: Chosen = eqx.field(static=True)
+    suspect: Float[Array, ""]
+    chosen: Chosen
 
     @property
     def gamma(self) -> float:
         """The penalty in use."""
-        return self.chosen.gamma
+        return float(self.chosen.gamma)
+
+    @property
+    def quick(self) -> bool:
+        """Whether a row costs some ten filter steps, and not hundreds."""
+        return self._plain and self.witness is None and len(self.group) <= MANY
 
     def init(self) -> tuple[SecureFusionState, Estimate]:
         """The estimate one sample before the first row."""
-        m, d = self.scatter.shape[:2]
+        m, d = len(self.plant.outputs), len(self.bank.b)
         watching, warm = None, begin(self._columns(self.fusion), self._plain)
         if self.witness is not None:
             # its weights change from row to row, and what a row ends with is of no use to the next
             watching, warm = self.witness.init(self.x0, self.P0), None
         state = SecureFusionState(
             self.bank.init(self.x0), self.x0, self.P0, warm, watching,
-            jnp.zeros((m, d)), jnp.zeros(m), jnp.zeros(()), jnp.asarray(0),
+            jnp.zeros((m, d)), jnp.zeros(m), jnp.zeros(m, bool), jnp.zeros(()), jnp.asarray(0),
         )  # fmt: skip
         nothing = jnp.zeros(m), jnp.zeros((m, m)), jnp.asarray(0)
         first = Estimate.without_attack(self.x0, self.P0, *nothing, a=jnp.zeros(m))
@@ -129,19 +149,22 @@ class SecureFusion(Estimator):
             fusion = Fusion(*self.witness.joined(watching))
             local, P = jnp.concatenate([zeta, watching.s]), fusion.P
             warm = begin(self._columns(fusion), self._plain)
-        answer, warm = self._fused(fusion, local, P, warm)
+        answer, warm = self._fused(fusion, local, P, warm, state.suspected)
         warm = warm if self.witness is None else None
         status = observation.status | jnp.where(
             answer.violation <= WRONG, 0, int(Status.NOT_CONVERGED)
         )
         status = status | jnp.where(answer.lost, int(Status.UNOBSERVABLE), 0)
         after = SecureFusionState(
-            zeta, answer.x, P, warm, watching, answer.f, answer.size, answer.violation,
-            answer.pivots,
+            zeta, answer.x, P, warm, watching, answer.f, answer.size, answer.suspected,
+            answer.violation, answer.pivots,
         )  # fmt: skip
+        m = self.plant.at(1, answer.others, observation.u)
+        off = observation.y - dot(m.C, answer.others) - dot(m.D, observation.u)
         estimate = Estimate.without_attack(
-            answer.x, answer.x_cov, innovation, spread, status, a=answer.offset
-        )
+            answer.x, answer.x_cov, innovation, spread, status,
+            a=jnp.where(answer.known & observation.seen, off, 0.0),
+        )  # fmt: skip
         return after, estimate
 
     @property
@@ -152,39 +175,51 @@ class SecureFusion(Estimator):
         """Z' in the coordinates of the penalty."""
         return dot(self.back.T, fusion.Z[: self.back.shape[0]])
 
-    def _fused(self, fusion: Fusion, local, P, warm):
-        """The minimiser of a row, what it says of each sensor, and the estimate that follows."""
-        m, d = self.scatter.shape[:2]
-        columns, pull = self._columns(fusion), dot(fusion.F[:, : m * d], self.back)
+    def _fused(self, fusion: Fusion, local, P, warm, held: Bool[Array, " m"]):
+        """The minimiser of a row, what it says of each sensor, and the estimate that follows.
+
+        A sensor that was suspected (``held``) stays so while what the others say of it differs
+        from zero: a penalty hides the tail of a lie.
+        """
+        m, d = len(held), len(self.bank.b)
+        columns = self._columns(fusion)
+        pull = dot(fusion.F[:, : m * d], self.back)
+        member = jnp.any(self.back.reshape(m, d, -1) != 0, 1).astype(float)
+
+        def sizes(f):
+            return jnp.sqrt(jnp.sum(dot(member * f, columns) ** 2, 1))
+
         c = -dot(fusion.Z.T, local)
         solution, warm = solve(columns, self.weight, c, np.array(self.group, int), warm)
-        f = dot(self.back, solution.f).reshape(m, d)
-        size = jnp.sqrt(jnp.einsum("ide,id,ie->i", self.scatter, f, f))
-        suspected = size > self.suspect
-        lying = dot(jnp.repeat(suspected, d).astype(float), jnp.abs(self.back)) > 0
+        size = sizes(solution.f)
+        lying = dot(((size > self.suspect) | held).astype(float), member) > 0
 
         active = solution.f != 0
-        released = _Released.of(columns, lying)
+        released = Released.of(columns, lying)
         freed = released.solve(dot(columns, c))
-        offset = -dot(dot(self.back, freed).reshape(m, d), self.inflow)
-        offset = jnp.where(suspected & ~released.dependent, offset, 0.0)
+        held = held & ~released.dependent & (sizes(freed) > self.release)
+        suspected = (size > self.suspect) | held
+        kalman = dot(fusion.F, local)
+        lost = jnp.asarray(False)
+        chosen, answer, drawn = active, solution.f, dot(columns, solution.p)
         if self.refit:
-            lost, chosen = released.dependent, jnp.where(released.dependent, active, lying)
-            answer = jnp.where(lost, solution.f, freed)
-            drawn = jnp.where(lost, dot(columns, solution.p), 0.0)
-        else:
-            lost, chosen, answer = jnp.asarray(False), active, solution.f
-            drawn = dot(columns, solution.p)
-        of_chosen = _Released.of(columns, chosen)
+            lost = released.dependent
+            # while nobody is suspected the penalty is what guards against a lie that is still small
+            fresh = jnp.any(lying) & ~lost
+            chosen, answer = jnp.where(fresh, lying, active), jnp.where(fresh, freed, answer)
+            drawn = jnp.where(fresh, 0.0, drawn)
+        of_chosen = Released.of(columns, chosen)
         half = of_chosen.half(pull.T)
         pulled = dot(pull, of_chosen.solve(drawn))
         x_cov = P + dot(half.T, half) + pulled[:, None] * pulled
         return _Answer(
-            dot(fusion.F, local) + dot(pull, answer),
+            kalman + dot(pull, answer),
             jnp.where(of_chosen.dependent, jnp.diag(jnp.full(len(P), jnp.inf)), x_cov),
-            f,
+            dot(self.back, solution.f).reshape(m, d),
             size,
-            offset,
+            kalman + dot(pull, freed),
+            suspected,
+            suspected & ~released.dependent,
             lost,
             solution.residual,
             solution.pivots,
@@ -192,51 +227,20 @@ class SecureFusion(Estimator):
 
 
 class _Answer(NamedTuple):
-    """What the fusion says at a row; ``lost``: without the suspected sensors it says nothing."""
+    """What the fusion says at a row; ``others``: the estimate without the suspected sensors;
+    ``known``: the suspected, where there is one; ``lost``: there is none, and it was asked for.
+    """
 
     x: Float[Array, " n"]
     x_cov: Float[Array, "n n"]
     f: Float[Array, "m d"]
     size: Float[Array, " m"]
-    offset: Float[Array, " m"]
+    others: Float[Array, " n"]
+    suspected: Bool[Array, " m"]
+    known: Bool[Array, " m"]
     lost: Bool[Array, ""]
     violation: Float[Array, ""]
     pivots: Int[Array, ""]
-
-
-class _Released(NamedTuple):
-    """Least squares over marked columns: (Z_A Z_A')^-1, rows and columns scaled to one.
-
-    ``dependent``: some marked column is a combination of others, and nothing is solved.
-    """
-
-    marked: Bool[Array, " M"]
-    scale: Float[Array, " M"]
-    lower: Float[Array, "M M"]
-    dependent: Bool[Array, ""]
-
-    @classmethod
-    def of(cls, columns: Float[Array, "M r"], marked: Bool[Array, " M"]) -> "_Released":
-        """The factor of the Gram matrix of the marked columns."""
-        length = jnp.sqrt(jnp.sum(columns**2, 1))
-        scale = jnp.where(marked & (length > 0), 1.0 / jnp.where(length > 0, length, 1.0), 0.0)
-        unit = scale[:, None] * columns
-        gram = dot(unit, unit.T)
-        lower = jnp.linalg.cholesky(gram + jnp.diag(jnp.where(marked, RANK_TOLERANCE**1.5, 1.0)))
-        pivots = jnp.where(marked, jnp.diagonal(lower) ** 2, 1.0)
-        dependent = ~jnp.all(pivots > RANK_TOLERANCE)
-        return cls(marked, scale, jnp.where(dependent, jnp.eye(len(marked)), lower), dependent)
-
-    def half(self, b: Float[Array, "M *k"]) -> Float[Array, "M *k"]:
-        """H with H' H = b' (Z_A Z_A')^-1 b."""
-        shape = (-1,) + (1,) * (b.ndim - 1)
-        scaled = self.scale.reshape(shape) * b
-        return jax.scipy.linalg.solve_triangular(self.lower, scaled, lower=True)
-
-    def solve(self, b: Float[Array, " M"]) -> Float[Array, " M"]:
-        """(Z_A Z_A')^-1 b on the marked columns, 0 elsewhere."""
-        back = jax.scipy.linalg.solve_triangular(self.lower, self.half(b), trans=1, lower=True)
-        return self.scale * back
 
 
 def build(
@@ -265,8 +269,8 @@ def build(
     ``attack_size`` standard deviations of each sensor. ``norm``: the paper's modulus, or "group",
     one norm per sensor. ``gain``, ``bound``: as `decomposition.build`. ``trusted``: outputs that
     are always authenticated; ``authenticated``: outputs that are now and then, by the
-    observation's flags. ``suspect``: standard deviations of its local error from which a sensor
-    is suspected; ``refit``: estimate without the suspected.
+    observation's flags. ``suspect``: what a lie has to change, in standard deviations,
+    for its sensor to be suspected; ``refit``: estimate without the suspected.
 
     Raises `InvalidValue` for what cannot be, naming the key.
     """
@@ -275,12 +279,7 @@ def build(
         _numbers(plant, "trusted", trusted),
         _numbers(plant, "authenticated", authenticated),
     )
-    if gamma is not None and rule is not None:
-        raise InvalidValue("rule", repr(rule), "no rule beside a gamma that is given")
-    if gamma is not None and not (np.isfinite(gamma) and gamma > 0):
-        raise InvalidValue("gamma", gamma, "a positive number")
-    if not suspect > 0:
-        raise InvalidValue("suspect", suspect, "a positive number of standard deviations")
+    _check(gamma, rule, share, attack_size, norm, suspect)
     if norm == "modulus" and local.coordinates.condition > ILL_CONDITIONED:
         warnings.warn(
             f"the paper's coordinates have the condition number {local.coordinates.condition:.1g} "
@@ -291,14 +290,12 @@ def build(
     fused, found = least_squares(local.G, local.W), penalty(local, norm, honest)
     if gamma is None:
         sizes = attack_size * np.sqrt(np.diagonal(np.asarray(plant.R)))
-        rule = rule or "loss"
-        share = _share(rule, share)
-        chosen = choose(local, fused, found, rule, share, sizes, seed)
+        sizes[honest] = 0.0
+        usual = 0.95 if rule == "coincide" else 0.01
+        share = usual if share is None else share
+        chosen = choose(local, fused, found, rule or "loss", share, sizes, seed)
     else:
-        chosen = costs(local, fused, found, gamma, seed)
-    m, d = local.sensors, len(local.b)
-    blocks = [local.W[i * d : (i + 1) * d, i * d : (i + 1) * d] for i in range(m)]
-    settled = np.linalg.solve(np.eye(d) - local.S, local.b)
+        chosen = costs(local, fused, found, float(gamma), seed)
     return SecureFusion(
         plant=plant,
         bank=bank,
@@ -306,23 +303,33 @@ def build(
         **dict(zip(("x0", "P0"), start(plant, x0, P0, local.P), strict=True)),
         weight=jnp.asarray(chosen.gamma * found.weight),
         back=jnp.asarray(found.back),
-        inflow=jnp.asarray(settled / (settled @ settled)),
-        scatter=jnp.asarray(np.linalg.inv(np.stack(blocks))),
+        release=jnp.sqrt(jnp.asarray(chdtri(len(local.b), RELEASED))),
         witness=witness(plant, local, members) if members else None,
         group=tuple(int(g) for g in found.group),
         kalman=gain is None and bound is None,
-        suspect=suspect,
+        suspect=jnp.asarray(suspect, float),
         refit=refit,
-        chosen=chosen,
+        chosen=jax.tree.map(lambda found: jnp.asarray(found, float), chosen),
     )
 
 
-def _share(rule: Rule, share: float | None) -> float:
-    if share is None:
-        return 0.95 if rule == "coincide" else 0.01
-    if not 0 < share < 1:
+def _check(gamma, rule, share, attack_size, norm, suspect) -> None:
+    """The first key that cannot be, as `InvalidValue`."""
+    for key, value, allowed in (("rule", rule, RULES), ("norm", norm, ("modulus", "group"))):
+        if value not in (None, *allowed):
+            raise InvalidValue(key, repr(value), " or ".join(map(repr, allowed)))
+    if gamma is not None and rule is not None:
+        raise InvalidValue("rule", repr(rule), "no rule beside a gamma that is given")
+    if gamma is not None and not (np.isfinite(gamma) and gamma > 0):
+        raise InvalidValue("gamma", gamma, "a positive number")
+    if share is not None and (gamma is not None or rule == "worst_case"):
+        raise InvalidValue("share", share, 'no share without the rule "coincide" or "loss"')
+    if share is not None and not 0 < share < 1:
         raise InvalidValue("share", share, "a number between 0 and 1")
-    return share
+    if not (np.isfinite(attack_size) and attack_size > 0):
+        raise InvalidValue("attack_size", attack_size, "a positive number of standard deviations")
+    if not suspect > 0:
+        raise InvalidValue("suspect", suspect, "a positive number of standard deviations")
 
 
 def _numbers(plant: LinearPlant, key: str, names: Sequence[str]) -> list[int]:

@@ -29,6 +29,9 @@ ROUNDING = 1e-13
 RIDGE = 1e-14
 """What is added to the diagonal of a Newton step, relative: more groups than r can be active on
 the way, and then the step goes along what is singular until a group vanishes."""
+REACHED = 0.25
+"""Violation, relative to eps |Z| |Z'| |f|, at which nothing is to be gained: f itself is
+rounded. It is above `ROUNDING` where rows of Z are long and nearly dependent."""
 ROUNDS = 40
 ROUNDS_PER_GROUP = 8
 BISECTIONS = 60
@@ -93,7 +96,7 @@ def group_lasso(
 
     ``residual``: max over groups of the violated condition above, relative to
     max w + max |Z_g c|; ``pivots``: rounds, at most 40 + 8 per group. Where that is reached, the
-    best f met is given with its residual.
+    best f met is given with its residual. A c that is not finite: nor is the residual.
 
     Source: DECOMPOSE (31) with complex entries or a norm per sensor.
     """
@@ -111,7 +114,7 @@ def group_lasso(
             jnp.where(better, s.f, s.best),
             jnp.where(better, wrong, s.least),
             _improved(problem, s.f, at),
-            wrong <= ROUNDING * scale,
+            ~(wrong > jnp.maximum(ROUNDING * scale, REACHED * _rounding(problem, s.f))),
             s.rounds + 1,
         )
 
@@ -120,7 +123,8 @@ def group_lasso(
     wrong = jnp.asarray(jnp.inf)
     first = _Round(start, wrong, start, jnp.asarray(False), jnp.asarray(0))
     last = jax.lax.while_loop(lambda s: ~s.done & (s.rounds < most), turn, first)
-    residual = jnp.maximum(last.least, 0.0) / jnp.where(scale > 0, scale, 1.0)
+    # a scale that is not a number shows in the residual
+    residual = jnp.maximum(last.least, 0.0) / jnp.where(scale == 0, 1.0, scale)
     return Solution(last.best, c - last.best @ Z, residual, last.rounds)
 
 
@@ -134,6 +138,12 @@ def _state(problem: _Problem, f) -> _State:
     )
     excess = jnp.where(active, -jnp.inf, problem.norms(grad) - problem.w)
     return _State(grad, size, unit, missed, excess, problem.norms(missed))
+
+
+def _rounding(problem: _Problem, f) -> Float[Array, ""]:
+    """What rounding f may do to the gradient."""
+    size = jnp.abs(problem.Z)
+    return jnp.finfo(f.dtype).eps * jnp.max(problem.norms(size @ (jnp.abs(f) @ size)))
 
 
 def _spread(problem: _Problem, of_groups: Float[Array, " g"]) -> Float[Array, " N"]:

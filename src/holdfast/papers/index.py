@@ -2,7 +2,10 @@
 
 from collections.abc import Callable
 
-from holdfast.papers import care
+from holdfast.papers import care, decompose
 from holdfast.papers.rows import Study
 
-STUDIES: dict[str, Callable[[], Study]] = {"care": care.study}
+STUDIES: dict[str, Callable[[], Study]] = {
+    "care": care.study,
+    "decompose": decompose.study,
+}

@@ -110,6 +110,27 @@ def attacks(data: xr.Dataset, window: Window, layout: Layout = WIDE) -> Figure:
     return _bands(data, "d", truth, window, layout, zero=True)
 
 
+def sensor_attacks(data: xr.Dataset, window: Window, layout: Layout = WIDE) -> Figure:
+    """What each sensor is believed to be off by, and the injection where it is known."""
+    t, value = data.time.values, data.sensor_attack.values
+    truth = data.injected_y.values if "injected_y" in data else None
+    with matplotlib.rc_context(STYLE):
+        figure, panels = _panels(_names(data, "output"), layout)
+        for i, panel in enumerate(panels):
+            _shade(panel, t, window)
+            _line(panel, t, value[:, i], layout.bins, color=MAIN, lw=1.1)
+            if truth is not None:
+                panel.plot(*extremes(t, truth[:, i], layout.bins), color=INK, lw=0.9,
+                           ls=(0, (4, 3)))  # fmt: skip
+        _legend(figure, [
+            Line2D([], [], color=MAIN, lw=1.2, label="estimate"),
+            *([Line2D([], [], color=INK, lw=0.9, ls=(0, (4, 3)), label="truth")]
+              if truth is not None else []),
+            *_window_key(window),
+        ], layout)  # fmt: skip
+    return figure
+
+
 def residuals(data: xr.Dataset, window: Window, layout: Layout = WIDE) -> Figure:
     """Each residual over its standard deviation, with the lines at +-2."""
     variance = np.diagonal(data.residual_cov.values, axis1=-2, axis2=-1)

@@ -8,11 +8,12 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from holdfast.report.drawing import ALARM, FAULT, INK, MAIN
+from holdfast.report.drawing import ALARM, ATTACK, FAULT, GRID, INK, LOST, MAIN
 from holdfast.report.figures import STYLE
 
 DASHED = ("truth", "threshold")
-WIDTH, HEIGHT = 8.4, 2.1
+COLOURS = (ALARM, MAIN, FAULT, "#009e73", ATTACK, LOST)
+WIDTH, HEIGHT, TALL = 8.4, 2.1, 3.2
 DOTS_PER_INCH = 150
 
 
@@ -26,7 +27,26 @@ class Panel(NamedTuple):
 
 def stacked(t: np.ndarray, panels: list[Panel]) -> Figure:
     """The panels over ``t`` in seconds, with one legend."""
-    colours = iter((ALARM, MAIN, FAULT))
+    return _drawn(t, panels, "time (s)", HEIGHT)
+
+
+def over(x: np.ndarray, panels: list[Panel], label: str, *, same: bool = False) -> Figure:
+    """The panels, higher than those over time, over a positive quantity on a logarithmic axis.
+
+    ``same``: they share the vertical axis too.
+    """
+    figure = _drawn(x, panels, label, TALL, same=same)
+    for place in figure.axes:
+        place.set_xscale("log")
+        place.set_xlim(x[0], x[-1])
+        place.grid(True, which="major", color=GRID, lw=0.5)
+    return figure
+
+
+def _drawn(
+    x: np.ndarray, panels: list[Panel], label: str, height: float, *, same: bool = False
+) -> Figure:
+    colours = iter(COLOURS)
     style = {}
     for name in dict.fromkeys(name for panel in panels for name in panel.lines):
         if name in DASHED:
@@ -34,16 +54,16 @@ def stacked(t: np.ndarray, panels: list[Panel]) -> Figure:
         else:
             style[name] = {"color": next(colours), "lw": 0.9}
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 0.6 + HEIGHT * len(panels)), layout="constrained")
-        axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+        figure = Figure(figsize=(WIDTH, 0.6 + height * len(panels)), layout="constrained")
+        axes = figure.subplots(len(panels), 1, sharex=True, sharey=same, squeeze=False)[:, 0]
         for place, panel in zip(axes, panels, strict=True):
             place.set_title(panel.title)
-            place.set_xlim(0, t[-1])
+            place.set_xlim(0, x[-1])
             if panel.log:
                 place.set_yscale("log")
             for name, values in panel.lines.items():
-                place.plot(t, values, label=name, **style[name])
-        axes[-1].set_xlabel("time (s)")
+                place.plot(x, values, label=name, **style[name])
+        axes[-1].set_xlabel(label)
         found = {
             label: line
             for place in axes

@@ -52,6 +52,11 @@ def draw(data: xr.Dataset, summary: Mapping[str, Any], window: Window) -> dict[s
             "the band (twice the standard deviation either side) covers zero; there is a gap "
             f"where the data do not determine it.{truth}{shaded}{_left_out(data, 'attack')}",
             lambda layout: figures.attacks(data, window, layout))  # fmt: skip
+    if "sensor_attack" in data and np.any(data.sensor_attack.values != 0):
+        add("sensor_attacks", "What each sensor is believed to be off by, over time",
+            "Zero where the sensor is believed. A suspected sensor is given the constant offset "
+            f"that would explain it best.{truth}{shaded}{_left_out(data, 'output')}",
+            lambda layout: figures.sensor_attacks(data, window, layout))  # fmt: skip
     place = map_pair(data.state.values)
     if place is not None:
         add("path", "Path on a map: estimated, measured and, if simulated, true",
