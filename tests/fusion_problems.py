@@ -10,6 +10,7 @@ import clarabel
 import numpy as np
 import scipy.sparse as sp
 
+from decomposed import covariance, decomposable, forgotten, similar
 from holdfast.numerics.jordan import Coordinates
 from holdfast.numerics.local import Local, decompose, least_squares
 from holdfast.numerics.steady_state import steady_state
@@ -45,13 +46,33 @@ def papers_example() -> Local:
     return decompose(**PAPER, K=steady_state(**PAPER).K)
 
 
+def drawn(seed: int) -> Local:
+    """Of `decomposed.decomposable`."""
+    s = decomposable(seed)
+    return decompose(s.A, s.C, s.Q, s.R, s.K)
+
+
+def nearly_repeated(apart: float) -> Local:
+    """Three states, six sensors, two of the eigenvalues ``apart``."""
+    rng = np.random.default_rng(1)
+    while True:
+        M = similar(rng, np.diag([0.3, 0.3 + apart, -0.4]))
+        C, P, R = rng.normal(size=(6, 3)) / np.sqrt(6), covariance(rng, 3), covariance(rng, 6)
+        K = np.linalg.solve(C @ P @ C.T + R, C @ P).T
+        A = np.linalg.solve(np.eye(3) - K @ C, M)
+        if forgotten(A, M) < 1e3:
+            return decompose(A, C, covariance(rng, 3), R, K)
+
+
 def fusion(local: Local, norm: str = "l1") -> Fusion:
-    """With the paper's l1 norm, or with the 2-norm of each sensor ("sensor")."""
+    """With the paper's l1 norm, the l1 norm of the bank's own coordinates ("own"), or the
+    2-norm of each sensor ("sensor")."""
     m, d = local.sensors, len(local.b)
     found: Coordinates = local.coordinates
     if norm == "sensor":
-        back, groups = np.eye(d), np.zeros(d, int)
-        weight = np.ones(1)
+        back, groups, weight = np.eye(d), np.zeros(d, int), np.ones(1)
+    elif norm == "own":
+        back, groups, weight = np.eye(d), np.arange(d), np.ones(d)
     else:
         back, groups, weight = np.linalg.inv(found.rows), found.group, found.weight
     Z = least_squares(local.G, local.W).Z
@@ -83,6 +104,44 @@ def stream(
         error = whole @ error + root @ rng.normal(size=len(whole))
         moved = moved @ S.T + np.outer(bias + shake * rng.normal(size=m), b)
         found.append(moved.reshape(-1) - error)
+    return np.array(found)
+
+
+class Problems(NamedTuple):
+    """Problems of one `Fusion`, one for each entry of the first axis."""
+
+    of: Fusion
+    zeta: np.ndarray
+    w: np.ndarray
+    c: np.ndarray
+
+
+def problems(of: Fusion, seed: int, steps: int, largest: float = 1e8) -> Problems:
+    """A stream with attacks of 1 to ``largest``; gamma from 0.03 to 30, new every ten steps."""
+    rng = np.random.default_rng(seed)
+    zeta = stream(of.local, rng, steps, 10.0 ** np.arange(0, np.log10(largest) + 0.5))
+    gamma = np.exp(np.repeat(rng.uniform(np.log(0.03), np.log(30), -(-steps // 10)), 10)[:steps])
+    return Problems(of, zeta, gamma[:, None] * of.weight, -zeta @ of.to_c.T)
+
+
+def violations(given: Problems, f: np.ndarray) -> np.ndarray:
+    """`missed` of each, relative."""
+    pairs = [
+        missed(given.of.Z, given.of.group, w, c, phi)
+        for w, c, phi in zip(given.w, given.c, f, strict=True)
+    ]
+    return np.array([worst / scale for worst, scale in pairs])
+
+
+def rounded(given: Problems, f: np.ndarray) -> np.ndarray:
+    """What rounding f alone may make of `violations`: eps |Z| |Z'| |f|."""
+    Z, group = np.abs(given.of.Z), given.of.group
+    eps = np.finfo(float).eps
+    found = [
+        eps * np.max(norms(Z @ (Z.T @ np.abs(phi)), group))
+        / (np.max(w) + np.max(norms(given.of.Z @ c, group)))
+        for w, c, phi in zip(given.w, given.c, f, strict=True)
+    ]  # fmt: skip
     return np.array(found)
 
 
@@ -118,6 +177,8 @@ def objective(Z, group, w, c, f) -> float:
 
 
 class Conic(NamedTuple):
+    """The value of (31) and its minimiser; ``gap`` to the dual value, relative."""
+
     objective: float
     gap: float
     x: np.ndarray
@@ -129,15 +190,13 @@ def conic(of: Fusion, w: np.ndarray, zeta: np.ndarray) -> Conic:
 
         minimise  1/2 v' W^-1 v + w' t    zeta = G x - v - phi,  |phi_g| <= t_g
 
-    in units in which zeta is of size 1 (else v, x and phi, with the multipliers, differ by the
-    size of the attack). Variables: u with v = L u, W = L L'; x; phi as penalised; t.
+    in units in which zeta is of size 1, and the second time the value as well: else the
+    tolerances mean little. Variables: u with v = L u, W = L L'; x; phi as penalised; t.
     """
     G, L = of.local.G, np.linalg.cholesky(of.local.W)
     N, n, g = len(zeta), G.shape[1], len(w)
     unit = max(1.0, float(np.max(np.abs(zeta))))
     back = np.kron(np.eye(of.local.sensors), of.back)
-    P = sp.block_diag([sp.eye(N), sp.csc_matrix((n + N + g, n + N + g))], format="csc")
-    q = np.concatenate([np.zeros(N + n + N), w / unit])
     equal = np.hstack([-L, G, -back, np.zeros((N, g))])
     rows, cones = [equal], [clarabel.ZeroConeT(N)]
     for k in range(g):
@@ -151,13 +210,14 @@ def conic(of: Fusion, w: np.ndarray, zeta: np.ndarray) -> Conic:
     right = np.concatenate([zeta / unit, np.zeros(A.shape[0] - N)])
     settings = clarabel.DefaultSettings()
     settings.verbose = False
-    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-13
-    settings.tol_ktratio = 1e-10
-    settings.max_iter = 500
-    found = clarabel.DefaultSolver(P, q, A, right, cones, settings).solve()
-    assert str(found.status) in ("Solved", "AlmostSolved"), found.status
-    value = np.array(found.x)
-    gap = abs(found.obj_val - found.obj_val_dual) / max(1e-300, abs(found.obj_val))
-    return Conic(
-        found.obj_val * unit**2, gap, unit * value[N : N + n], unit * value[N + n : 2 * N + n]
-    )
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-12
+    value = 1.0
+    for _ in range(2):
+        P = sp.block_diag([sp.eye(N) / value, sp.csc_matrix((n + N + g,) * 2)], format="csc")
+        q = np.concatenate([np.zeros(N + n + N), w / unit / value])
+        found = clarabel.DefaultSolver(P, q, A, right, cones, settings).solve()
+        assert str(found.status) == "Solved", found.status
+        value *= found.obj_val
+    gap = abs(found.obj_val - found.obj_val_dual) / abs(found.obj_val)
+    z = unit * np.array(found.x)
+    return Conic(value * unit**2, gap, z[N : N + n], z[N + n : 2 * N + n])

@@ -27,7 +27,9 @@ VAGUE = 1e8
 """Variance, relative to that of the whole fusion, from which the filter starts again about the
 secure estimate: a mode that nobody vouches for must not grow out of the range of numbers, and a
 weight of 1e-8 decides nothing."""
-JITTER = 1e-12
+JITTER = 1e-8
+"""What is added to the variances of the filter where they are joined, relative to them: where
+every sample is authenticated the filter says what the local estimates say, but for rounding."""
 
 
 class WitnessState(eqx.Module):
@@ -85,7 +87,7 @@ class Witness(eqx.Module):
 
     def joined(self, state: WitnessState) -> tuple[Array, Array, Array]:
         """F, Z and P of the fusion of local estimates and s (`holdfast.numerics.local`)."""
-        sizes = jnp.diagonal(state.P) + JITTER * jnp.diagonal(self.vague)
+        sizes = jnp.diagonal(state.P) + jnp.diagonal(self.vague) / VAGUE
         P = state.P + JITTER * jnp.diag(sizes)
         W = jnp.block([[self.W, state.X], [state.X.T, P]])
         root = jnp.sqrt(jnp.diagonal(W))
@@ -115,6 +117,6 @@ def witness(plant: LinearPlant, local: Local, members: Any) -> Witness:
     U = np.linalg.qr(U)[0]
     A_s, C_s = U.T @ A @ U, np.where(chosen[:, None], C @ U, 0.0)
     enter = local.G - np.kron(C, local.b[:, None])
-    vague = VAGUE * U.T @ local.P @ U + JITTER * np.eye(U.shape[1])
+    vague = VAGUE * U.T @ local.P @ U
     arrays = (U, A_s, C_s, chosen, local.S, local.b, enter, local.G, local.W, vague)
     return Witness(plant, *map(jnp.asarray, arrays))
