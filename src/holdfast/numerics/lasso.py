@@ -204,7 +204,8 @@ def _refined(slabs: _Slabs, c, warm: Warm):
 
 def _solve(slabs: _Slabs, c, warm: Warm, careful: bool):
     """The last state, and its multipliers and point to full precision; a multiplier never has
-    the wrong sign."""
+    the wrong sign.
+    """
     weight, p = _on_faces(slabs, c, warm, 1)
     place = dot_rows(slabs.normal, p[None])
     none = jnp.zeros_like(warm.active)
