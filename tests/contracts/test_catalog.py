@@ -54,7 +54,12 @@ ESTIMATOR_SETTINGS = {
     "care": {},
     "extended": {},
     "unscented": {},
+    "decomposition": {},
+    "secure_fusion": {"gamma": 2.0},
 }
+# Filters with a fixed gain: where a sensor never arrives its gain is not used, but those of the
+# others stay, and so the filter is not that of a plant without the sensor.
+FIXED_GAIN = {"decomposition", "secure_fusion"}
 DETECTOR_SETTINGS = {
     "chi_square": {},
     "windowed": {"length": 4},
@@ -103,10 +108,29 @@ def test_every_entry_is_covered(catalog, covered):
     ],
 )
 def test_estimators(kind, plant):
-    settings = ESTIMATOR_SETTINGS[kind]
-    check_estimator(
-        lambda plant: ESTIMATORS[kind](plant, X0, P0, **settings), PLANTS[plant], steps=20
-    )
+    def build(plant):
+        return ESTIMATORS[kind](plant, X0, P0, **ESTIMATOR_SETTINGS[kind])
+
+    if kind in FIXED_GAIN:
+        check_estimator(build(PLANTS[plant]), steps=20)
+    else:
+        check_estimator(build, PLANTS[plant], steps=20)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "settings"),
+    [
+        ("decomposition", {"bound": 10.0}),
+        ("secure_fusion", {"gamma": 2.0, "refit": True}),
+        ("secure_fusion", {"gamma": 2.0, "norm": "group"}),
+        ("secure_fusion", {"gamma": 2.0, "trusted": ["wheel"], "bound": 10.0}),
+        ("secure_fusion", {"gamma": 2.0, "authenticated": ["gps", "flow"]}),
+    ],
+    ids=["bound", "refit", "group", "trusted", "authenticated"],
+)
+def test_estimators_with_other_settings(kind, settings):
+    check_estimator(ESTIMATORS[kind](PLANTS["both"], X0, P0, **settings), steps=20)
 
 
 @pytest.mark.parametrize("on", ["attack", "residual"])

@@ -2,6 +2,7 @@
 
 import csv
 import io
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -69,6 +70,77 @@ def test_columns_and_empty_cells(plant):
     assert (third["d:b"], third["d_sd:b"], third["d:a"]) == ("", "", "3.0")
     assert (third["alarm"], third["alarm:a"], third["reason"]) == ("1", "1", "attack on a+b")
     assert third["status"] == "MISSING+UNOBSERVABLE"
+
+
+def with_sensor_attack():
+    """What an estimator says each sensor's samples are off by: 0 where it believes them."""
+    trace = trace_of_three_rows()
+    a = jnp.asarray([[0.0, 0.0], [0.0, -2.5], [1 / 3, 0.0]])
+    return replace(trace, estimate=replace(trace.estimate, a=a)), np.asarray(a)
+
+
+def test_sensor_attack_columns(plant):
+    """One column per output, after those of the attack channels, in every row."""
+    trace, a = with_sensor_attack()
+    rows = rows_of(trace, plant, np.array([0.1, 0.2, 0.3]))
+    names = list(rows[0])
+    at = names.index("d_sd:b") + 1
+    assert names[at : at + 3] == ["a:gps", "a:wheel", "statistic"]
+    written = [[float(row[f"a:{name}"]) for name in plant.outputs] for row in rows]
+    np.testing.assert_array_equal(written, a)
+    others = rows_of(trace_of_three_rows(), plant, np.array([0.1, 0.2, 0.3]))
+    assert [{k: v for k, v in row.items() if not k.startswith("a:")} for row in rows] == others
+
+
+def test_netcdf_keeps_the_sensor_attack(folder, plant):
+    import xarray as xr
+
+    trace, a = with_sensor_attack()
+    time = np.array([0.1, 0.2, 0.3])
+    write_result(folder / "with.nc", trace, plant, time)
+    write_result(folder / "without.nc", trace_of_three_rows(), plant, time)
+    with xr.open_dataset(folder / "with.nc", engine="h5netcdf") as data:
+        np.testing.assert_array_equal(data.sensor_attack.values, a)
+        assert data.sensor_attack.dims == ("time", "output")
+        assert list(data.output.values) == list(plant.outputs)
+    with xr.open_dataset(folder / "without.nc", engine="h5netcdf") as data:
+        assert "sensor_attack" not in data
+
+
+FUSING = """
+[plant]
+kind = "linear"
+A = [[1.0, 0.1], [0.0, 0.97]]
+C = [[1.0, 0.0], [0.0, 1.0], [1.0, 1.0], [1.0, -1.0]]
+Q = [[0.02, 0.01], [0.01, 0.03]]
+R = [[0.1, 0, 0, 0], [0, 0.1, 0, 0], [0, 0, 0.1, 0], [0, 0, 0, 0.1]]
+outputs = ["gps", "wheel", "flow", "radar"]
+dt = 0.1
+[estimator]
+kind = "secure_fusion"
+gamma = 2.0
+[detector]
+threshold = 13.0
+"""
+
+
+def test_replay_names_the_lying_sensor(folder, command):
+    """From a log on disk: gps is off by 50 from row 40 on, and the others are believed."""
+    (folder / "fusing.toml").write_text(FUSING)
+    rng = np.random.default_rng(0)
+    y = 0.3 * rng.normal(size=(80, 4))
+    y[40:, 0] += 50.0
+    lines = ["time,y:gps,y:wheel,y:flow,y:radar"]
+    lines += [",".join(map(repr, [0.1 * (k + 1), *map(float, row)])) for k, row in enumerate(y)]
+    (folder / "fusing.csv").write_text("\n".join(lines) + "\n")
+    code, out, err = command("replay", folder / "fusing.toml", folder / "fusing.csv")
+    assert (code, err) == (0, "")
+    rows = list(csv.DictReader(io.StringIO(out)))
+    a = np.array([[float(row[f"a:{n}"]) for n in ("gps", "wheel", "flow", "radar")] for row in rows])
+    assert not np.any(a[:40])
+    assert not np.any(a[:, 1:])
+    # a sample and the estimate of the others, 0.3 and less each: 5 of them
+    np.testing.assert_allclose(a[45:, 0], 50.0, atol=5 * np.hypot(0.3, 0.3))
 
 
 def test_replay_writes_exactly_what_the_loop_says(folder, command):

@@ -28,6 +28,8 @@ itself."""
 DEAR_DRAWS = 400
 """The same where a bank has more than `MANY` penalty variables, or cones."""
 MANY = 60
+PARALLEL = 1e3
+"""Condition of the penalty's coordinates up to which the active-set method keeps its digits."""
 HALVINGS = 18
 GRID = 13
 FEWER = 8
@@ -39,18 +41,15 @@ class Penalty(NamedTuple):
 
     ``group`` (M,) numbers the group of each column, ``weight`` (g,) without gamma; ``change``
     (M x N) takes a bank's own coordinates to the penalty's, ``back`` (N x M) the other way, zero
-    for sensors that cannot lie.
+    for sensors that cannot lie. ``plain``: every column is a group of its own, and they are far
+    enough from parallel for the faster method.
     """
 
     group: np.ndarray
     weight: np.ndarray
     change: np.ndarray
     back: np.ndarray
-
-    @property
-    def plain(self) -> bool:
-        """Whether every column is a group of its own."""
-        return len(self.weight) == len(self.group)
+    plain: bool
 
 
 def penalty(local: Local, norm: Literal["modulus", "group"], honest: Sequence[int]) -> Penalty:
@@ -71,6 +70,7 @@ def penalty(local: Local, norm: Literal["modulus", "group"], honest: Sequence[in
         np.tile(weight, len(lying)),
         np.kron(pick, rows),
         np.kron(pick.T, np.linalg.inv(rows)),
+        len(weight) == len(group) and bool(np.linalg.cond(rows) <= PARALLEL),
     )
 
 
@@ -127,7 +127,8 @@ class _Benign(NamedTuple):
         Z = self.penalty.back.T @ self.fused.Z
         w = jnp.asarray(gamma * self.penalty.weight)
         c = jnp.asarray(self.c + shift @ self.fused.Z)
-        f = _minimisers(jnp.asarray(Z), w, c, tuple(self.penalty.group.tolist()))
+        group = tuple(self.penalty.group.tolist())
+        f = _minimisers(jnp.asarray(Z), w, c, group, self.penalty.plain)
         left = (shift - np.asarray(f) @ self.penalty.back.T) @ self.fused.F.T
         return self.trace + float(np.mean(np.sum(left**2, 1)))
 
@@ -184,10 +185,9 @@ def _benign(local: Local, fused: Residuals, found: Penalty, seed: int) -> _Benig
     return _Benign(c, fused, found, trace)
 
 
-@partial(jax.jit, static_argnames="group")
-def _minimisers(Z, w, c, group: tuple[int, ...]) -> Array:
+@partial(jax.jit, static_argnames=("group", "plain"))
+def _minimisers(Z, w, c, group: tuple[int, ...], plain: bool) -> Array:
     """The minimiser for each row of ``c``."""
-    plain = len(w) == len(group)
 
     def one(c):
         return solve(Z, w, c, np.array(group, int), begin(Z, plain))[0].f

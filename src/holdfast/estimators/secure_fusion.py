@@ -101,6 +101,7 @@ class SecureFusion(Estimator):
     release: Float[Array, ""]
     witness: Witness | None
     group: tuple[int, ...] = eqx.field(static=True)
+    plain: bool = eqx.field(static=True)
     kalman: bool = eqx.field(static=True)
     refit: bool = eqx.field(static=True)
     suspect: Float[Array, ""]
@@ -114,12 +115,12 @@ class SecureFusion(Estimator):
     @property
     def quick(self) -> bool:
         """Whether a row costs some ten filter steps, and not hundreds."""
-        return self._plain and self.witness is None and len(self.group) <= MANY
+        return self.plain and self.witness is None and len(self.group) <= MANY
 
     def init(self) -> tuple[SecureFusionState, Estimate]:
         """The estimate one sample before the first row."""
         m, d = len(self.plant.outputs), len(self.bank.b)
-        watching, warm = None, begin(self._columns(self.fusion), self._plain)
+        watching, warm = None, begin(self._columns(self.fusion), self.plain)
         if self.witness is not None:
             # its weights change from row to row, and what a row ends with is of no use to the next
             watching, warm = self.witness.init(self.x0, self.P0), None
@@ -148,7 +149,7 @@ class SecureFusion(Estimator):
             watching = self.witness.step(state.witness, state.x, observation)
             fusion = Fusion(*self.witness.joined(watching))
             local, P = jnp.concatenate([zeta, watching.s]), fusion.P
-            warm = begin(self._columns(fusion), self._plain)
+            warm = begin(self._columns(fusion), self.plain)
         answer, warm = self._fused(fusion, local, P, warm, state.suspected)
         warm = warm if self.witness is None else None
         status = observation.status | jnp.where(
@@ -166,10 +167,6 @@ class SecureFusion(Estimator):
             a=jnp.where(answer.known & observation.seen, off, 0.0),
         )  # fmt: skip
         return after, estimate
-
-    @property
-    def _plain(self) -> bool:
-        return len(set(self.group)) == len(self.group)
 
     def _columns(self, fusion: Fusion) -> Float[Array, "M r"]:
         """Z' in the coordinates of the penalty."""
@@ -306,6 +303,7 @@ def build(
         release=jnp.sqrt(jnp.asarray(chdtri(len(local.b), RELEASED))),
         witness=witness(plant, local, members) if members else None,
         group=tuple(int(g) for g in found.group),
+        plain=found.plain,
         kalman=gain is None and bound is None,
         suspect=jnp.asarray(suspect, float),
         refit=refit,

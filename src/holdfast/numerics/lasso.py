@@ -25,7 +25,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from holdfast.numerics.alone import any_of, dot_rows, first, largest, pick, total
 from holdfast.numerics.linalg import repeat
 
 ROUNDING = 1e-13
@@ -33,6 +32,8 @@ ROUNDING = 1e-13
 INDEPENDENT = 1e-8
 """Sine of the angle to the span of the active rows under which a row depends on them."""
 PIVOTS_PER_ROW = 8
+JUMP = 2
+"""Multipliers of the wrong sign, beside an eighth of them all, up to which a warm start is one."""
 REFINEMENTS, CAREFUL_REFINEMENTS = 2, 20
 WORN = 1e-8
 """Error of a table at which it is not started from: `REFINEMENTS` square it."""
@@ -115,9 +116,9 @@ def lasso(
 def _alone(Z, w, c, *warm):
     unit, length = _unit(Z)
     bound = w / length
-    reach = dot_rows(unit, c[None])
-    slabs = _Slabs(unit, bound, length, largest(bound) + largest(jnp.abs(reach)))
-    scale = largest(w) + largest(jnp.abs(length * reach))
+    reach = unit @ c
+    slabs = _Slabs(unit, bound, length, jnp.max(bound) + jnp.max(jnp.abs(reach)))
+    scale = jnp.max(w) + jnp.max(jnp.abs(length * reach))
 
     def attempt(carry):
         count, start, *_ = carry
@@ -158,7 +159,7 @@ def _(axis_size, in_batched, *given):
 
 
 def _unit(Z):
-    length = jnp.sqrt(dot_rows(Z, Z))
+    length = jnp.sqrt(jnp.sum(Z * Z, 1))
     length = jnp.where(length > 0, length, 1.0)
     return Z / length[:, None], length
 
@@ -174,9 +175,9 @@ def _on_faces(slabs: _Slabs, c, warm: Warm, rounds: int):
 
     def closer(_, carry):
         f, p = carry
-        missed = jnp.where(warm.active, dot_rows(slabs.normal, p[None]) - target, 0.0)
-        f = f + dot_rows(table, total(missed[:, None] * table)[None])
-        return f, c - total(f[:, None] * slabs.normal)
+        missed = jnp.where(warm.active, slabs.normal @ p - target, 0.0)
+        f = f + table @ (missed @ table)
+        return f, c - f @ slabs.normal
 
     return repeat(rounds, closer, (jnp.zeros_like(target), c))
 
@@ -186,15 +187,15 @@ def _refined(slabs: _Slabs, c, warm: Warm):
     table = jnp.where(warm.active[:, None], warm.table, 0.0)
 
     def missed_at(f):
-        p = c - total(f[:, None] * slabs.normal)
-        off = dot_rows(slabs.normal, p[None]) - warm.side * slabs.bound
+        p = c - f @ slabs.normal
+        off = slabs.normal @ p - warm.side * slabs.bound
         return jnp.where(warm.active, off, 0.0)
 
     def closer(carry):
         f, missed, _, rounds = carry
-        then = f + dot_rows(table, total(missed[:, None] * table)[None])
+        then = f + table @ (missed @ table)
         left = missed_at(then)
-        gains = largest(jnp.abs(left)) < largest(jnp.abs(missed))
+        gains = jnp.max(jnp.abs(left)) < jnp.max(jnp.abs(missed))
         return jnp.where(gains, then, f), jnp.where(gains, left, missed), gains, rounds + 1
 
     f = jnp.zeros_like(slabs.bound)
@@ -207,22 +208,25 @@ def _solve(slabs: _Slabs, c, warm: Warm, careful: bool):
     the wrong sign.
     """
     weight, p = _on_faces(slabs, c, warm, 1)
-    place = dot_rows(slabs.normal, p[None])
+    place = slabs.normal @ p
     none = jnp.zeros_like(warm.active)
-    # many pivots wear a table out
+    # many pivots wear a table out; and after a jump of c dropping what is wrong costs more, and
+    # more digits, than to begin with nothing
     off = jnp.where(warm.active, jnp.abs(place - warm.side * slabs.bound), 0.0)
-    fit = largest(off) <= WORN * slabs.scale
+    wrong = jnp.sum(jnp.where(warm.active & (weight * warm.side < 0), 1, 0))
+    few = wrong <= JUMP + jnp.sum(jnp.where(warm.active, 1, 0)) // 8
+    fit = few & (jnp.max(off) <= WORN * slabs.scale)
     empty = Warm(slabs.normal, none, jnp.zeros_like(weight))
     warm = jax.tree.map(lambda old, new: jnp.where(fit, old, new), warm, empty)
     weight = jnp.where(fit, weight, 0.0)
-    place = jnp.where(fit, place, dot_rows(slabs.normal, c[None]))
-    some = any_of(warm.active)
+    place = jnp.where(fit, place, slabs.normal @ c)
+    some = jnp.any(warm.active)
     most = PIVOTS_PER_ROW * (len(none) + 1)
     start = _Working(
         warm,
         place,
         weight,
-        jnp.where(warm.active, 1.0, dot_rows(warm.table, warm.table)),
+        jnp.where(warm.active, 1.0, jnp.sum(warm.table * warm.table, 1)),
         none,
         none,
         some,
@@ -234,7 +238,7 @@ def _solve(slabs: _Slabs, c, warm: Warm, careful: bool):
     )
     f = _refined(slabs, c, last.warm) if careful else _on_faces(slabs, c, last.warm, REFINEMENTS)[0]
     f = jnp.where(last.warm.active & (f * last.warm.side > 0), f, 0.0)
-    return last, f, c - total(f[:, None] * slabs.normal)
+    return last, f, c - f @ slabs.normal
 
 
 def _pivot(slabs: _Slabs, s: _Working, careful: bool) -> _Working:
@@ -247,52 +251,53 @@ def _pivot(slabs: _Slabs, s: _Working, careful: bool) -> _Working:
     """
     table, active, side = s.warm
     if careful:
-        s = s._replace(rest=jnp.where(active, 1.0, dot_rows(table, table)))
+        s = s._replace(rest=jnp.where(active, 1.0, jnp.sum(table * table, 1)))
     force = jnp.where(active, side * s.weight, jnp.inf)
-    lowest = -largest(-force)
+    lowest = -jnp.max(-force)
     settling = s.settling & (lowest < 0)
     excess = jnp.abs(s.place) - slabs.bound
     violated = ~active & ~s.passed & (excess > ROUNDING * slabs.scale)
     score = jnp.where(violated, excess, 0.0) * excess / jnp.maximum(s.rest, INDEPENDENT**2)
-    best = largest(score)
-    fresh = ~any_of(s.entering)
-    entering = jnp.where(fresh, first(score, best), s.entering)
+    best = jnp.max(score)
+    fresh = ~jnp.any(s.entering)
+    entering = jnp.where(fresh, _first(score, best), s.entering)
     # multipliers that turn negative on their own: the table is no more what it should be
     broken = fresh & ~s.settling & (lowest < -BROKEN * slabs.scale)
     done = (fresh & ~(best > 0) & ~settling) | broken
 
-    height, sign = pick(excess, entering), jnp.sign(pick(s.place, entering))
-    square = pick(s.rest, entering)
-    toward = dot_rows(table, pick(slabs.normal, entering)[None])
+    height, sign = _pick(excess, entering), jnp.sign(_pick(s.place, entering))
+    left = _pick(table, entering)
+    square = left @ left
+    toward = table @ _pick(slabs.normal, entering)
     rates = side * sign * toward
     falls = active & (rates > 0)
     last = jnp.where(falls, force, jnp.inf) / jnp.where(falls, rates, 1.0)
-    nearest = -largest(-last)
+    nearest = -jnp.max(-last)
     independent = square > INDEPENDENT**2
     adding = independent & (height <= nearest * square) & ~settling
     stuck = ~independent & (nearest == jnp.inf) & ~settling
     moves = ~(done | stuck)
-    chosen = first(jnp.where(settling, force, last), jnp.where(settling, lowest, nearest))
+    chosen = _first(jnp.where(settling, force, last), jnp.where(settling, lowest, nearest))
     chosen = jnp.where(adding, entering, chosen)
 
     # an added row leaves the others what is orthogonal to it, a dropped one gives its part back
-    along = pick(table, chosen)
+    along = _pick(table, chosen)
     if careful:
-        strays = dot_rows(slabs.normal, along[None]) - jnp.where(chosen, 1.0, 0.0)
+        strays = slabs.normal @ along - jnp.where(chosen, 1.0, 0.0)
         strays = jnp.where(active, strays, 0.0)
-        along = along - total(strays[:, None] * table)
-    square = total(along * along)
+        along = along - strays @ table
+    square = along @ along
     inverse = jnp.where(moves, 1.0, 0.0) / jnp.where(square > 0, square, 1.0)
-    across = dot_rows(slabs.normal, along[None])
-    of_active = jnp.where(adding, toward, dot_rows(table, along[None]))
+    across = slabs.normal @ along
+    of_active = jnp.where(adding, toward, table @ along)
     change = jnp.where(active, of_active, jnp.where(adding, across, -across)) * inverse
-    push = jnp.where(adding, sign * height, pick(s.weight, chosen))
+    push = jnp.where(adding, sign * height, _pick(s.weight, chosen))
     step = jnp.where(adding, push, -push) * inverse
     swapped = chosen & moves
-    left = table - change[:, None] * along[None]
+    others = table - change[:, None] * along[None]
     return _Working(
         Warm(
-            jnp.where(swapped[:, None], (inverse * along)[None], left),
+            jnp.where(swapped[:, None], (inverse * along)[None], others),
             active ^ swapped,
             jnp.where(swapped, jnp.where(adding, sign, 0.0), side),
         ),
@@ -310,6 +315,17 @@ def _pivot(slabs: _Slabs, s: _Working, careful: bool) -> _Working:
 
 
 def _residual(slabs: _Slabs, w, f, p, scale):
-    place = slabs.length * dot_rows(slabs.normal, p[None])
+    place = slabs.length * (slabs.normal @ p)
     missed = jnp.where(f != 0, jnp.abs(place - w * jnp.sign(f)), jnp.abs(place) - w)
-    return jnp.maximum(largest(missed), 0.0) / jnp.where(scale > 0, scale, 1.0)
+    return jnp.maximum(jnp.max(missed), 0.0) / jnp.where(scale > 0, scale, 1.0)
+
+
+def _pick(table, one_hot):
+    """The row that is marked; zero where none is."""
+    shape = (-1,) + (1,) * (table.ndim - 1)
+    return jnp.sum(jnp.where(one_hot.reshape(shape), table, 0.0), 0)
+
+
+def _first(values, wanted):
+    """One-hot: the first entry that equals ``wanted``."""
+    return jnp.arange(len(values)) == jnp.argmax(values == wanted)

@@ -19,13 +19,14 @@ adding or dropping a face changes every row by a multiple of one vector. The Gra
 a a' would serve as well, but squares the condition of nearly parallel faces.
 """
 
+import functools
+import operator
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from holdfast.numerics.lanes import any_of, dot_rows, first, in_lanes, largest, pick, total
 from holdfast.numerics.linalg import lower_factor, repeat
 
 ROUNDING = 1e-12
@@ -36,6 +37,9 @@ INDEPENDENT = 1e-8
 the part of a row's length under which the covariance does not see it. A covariance of
 condition 1e10 leaves 1e-5, rounding 1e-16 to 1e-11."""
 PIVOTS_PER_ROW = 8
+BLOCK = 64
+"""Problems of a batch that are worked on side by side: they fit the cache, and the loop ends
+with the slowest of 64 and not of all."""
 
 
 class Projection(NamedTuple):
@@ -115,13 +119,33 @@ def _alone(point, cov, rows, bound):
     return _lanes(point, cov, lower_factor(cov)[0], rows, bound)
 
 
-def _block(point, cov, rows, bound):
-    """A batch as the last axis of every array."""
+_project = jax.custom_batching.custom_vmap(_alone)
+
+
+@_project.def_vmap
+def _(axis_size, in_batched, *given):
+    """A batch as blocks, the last one filled up with problems met before."""
+    given = tuple(
+        a if of_a else jnp.broadcast_to(a, (axis_size, *a.shape))
+        for a, of_a in zip(given, in_batched, strict=True)
+    )
+    if axis_size <= BLOCK:
+        found = _block(given)
+    else:
+        fill = -axis_size % BLOCK
+        blocks = tuple(
+            jnp.concatenate([a, a[:fill]]).reshape(-1, BLOCK, *a.shape[1:]) for a in given
+        )
+        found = jax.lax.map(_block, blocks)
+        found = tuple(a.reshape(-1, *a.shape[2:])[:axis_size] for a in found)
+    return found, (True,) * len(found)
+
+
+def _block(given):
+    """A batch as the last axis of every array: the loop then works on whole vectors."""
+    point, cov, rows, bound = (jnp.moveaxis(a, 0, -1) for a in given)
     factor = jax.vmap(lower_factor, -1, -1)(cov)[0]
-    return _lanes(point, cov, factor, rows, bound)
-
-
-_project = in_lanes(_alone, _block)
+    return tuple(jnp.moveaxis(a, -1, 0) for a in _lanes(point, cov, factor, rows, bound))
 
 
 def _lanes(point, cov, factor, rows, bound):
@@ -129,16 +153,16 @@ def _lanes(point, cov, factor, rows, bound):
     there = bound != jnp.inf
     rows = jnp.where(there[:, None], rows, 0.0)
     bound = jnp.where(there, bound, 0.0)
-    slack = bound - dot_rows(rows, point[None])
-    scale = jnp.abs(bound) + dot_rows(jnp.abs(rows), jnp.abs(point)[None])
-    sane = jnp.isfinite(total(scale) + total(total(cov)))
+    slack = bound - _dot(rows, point[None])
+    scale = jnp.abs(bound) + _dot(jnp.abs(rows), jnp.abs(point)[None])
+    sane = jnp.isfinite(_sum(scale) + _sum(_sum(cov)))
 
-    spread = total([rows[:, i, None] * factor[i] for i in range(len(factor))])
-    size = total([jnp.abs(rows[:, i, None]) * jnp.abs(factor[i]) for i in range(len(factor))])
-    deviation = jnp.sqrt(dot_rows(spread, spread))
-    seen = deviation > INDEPENDENT * jnp.sqrt(dot_rows(size, size))
+    spread = _sum([rows[:, i, None] * factor[i] for i in range(len(factor))])
+    size = _sum([jnp.abs(rows[:, i, None]) * jnp.abs(factor[i]) for i in range(len(factor))])
+    deviation = jnp.sqrt(_dot(spread, spread))
+    seen = deviation > INDEPENDENT * jnp.sqrt(_dot(size, size))
     unit = jnp.where(seen, 1.0, 0.0) / jnp.where(seen, deviation, 1.0)
-    met = ~any_of(~seen & (slack < -ROUNDING * scale))
+    met = ~_any(~seen & (slack < -ROUNDING * scale))
 
     faces = _Faces(unit[:, None] * spread, unit * slack, unit * scale, seen & there)
     found = _solve(faces, sane & met)
@@ -146,7 +170,7 @@ def _lanes(point, cov, factor, rows, bound):
     active = found.active & feasible
     x, weight = _polished(faces, found, active)
     return (
-        jnp.where(any_of(active), point + dot_rows(factor, x[None]), point),
+        jnp.where(_any(active), point + _dot(factor, x[None]), point),
         active,
         jnp.where(active, unit * jnp.maximum(weight, 0.0), 0.0),
         jnp.where(feasible, _residual(faces, x, weight, active), 0.0),
@@ -161,7 +185,7 @@ def _solve(faces: _Faces, wanted: Bool[Array, "*b"]) -> _Working:
 
     def unfinished(s: _Working):
         violated = _waiting(faces, s) & (s.excess > _noise(faces, s.x))
-        return wanted & ~s.empty & (any_of(violated) | any_of(s.entering))
+        return wanted & ~s.empty & (_any(violated) | _any(s.entering))
 
     start = _Working(
         faces.normal, jnp.zeros_like(faces.normal[0]), -faces.distance, none, none, none,
@@ -180,7 +204,7 @@ def _waiting(faces: _Faces, s: _Working) -> Bool[Array, "m *b"]:
 
 def _noise(faces: _Faces, x: Float[Array, "n *b"]) -> Float[Array, "m *b"]:
     """The excess that rounding alone leaves at x."""
-    return ROUNDING * (faces.scale + jnp.sqrt(total(x * x)))
+    return ROUNDING * (faces.scale + jnp.sqrt(_sum(x * x)))
 
 
 def _pivot(faces: _Faces, s: _Working, unfinished: Bool[Array, "*b"]) -> _Working:
@@ -191,35 +215,35 @@ def _pivot(faces: _Faces, s: _Working, unfinished: Bool[Array, "*b"]) -> _Workin
     face is dropped and the entering one goes on; or neither ever does: the set is empty.
     """
     excess = jnp.where(_waiting(faces, s), s.excess, -jnp.inf)
-    fresh = ~any_of(s.entering)
-    entering = jnp.where(fresh, first(excess, largest(excess)), s.entering)
-    height = pick(s.excess, entering)
-    rest = pick(s.table, entering)
-    length = total(rest * rest)
+    fresh = ~_any(s.entering)
+    entering = jnp.where(fresh, _first(excess, _largest(excess)), s.entering)
+    height = _pick(s.excess, entering)
+    rest = _pick(s.table, entering)
+    length = _sum(rest * rest)
     independent = length > INDEPENDENT**2
-    rates = jnp.where(s.active, dot_rows(s.table, pick(faces.normal, entering)[None]), 0.0)
+    rates = jnp.where(s.active, _dot(s.table, _pick(faces.normal, entering)[None]), 0.0)
     noise = jnp.where(entering, 1.0, jnp.abs(rates)) * _noise(faces, s.x)
-    passing = unfinished & fresh & (height <= total(noise))
+    passing = unfinished & fresh & (height <= _sum(noise))
 
     falls = rates > 0
-    last = jnp.where(falls, dot_rows(s.table, s.x[None]), -jnp.inf) / jnp.where(falls, rates, 1.0)
-    nearest = largest(last)
+    last = jnp.where(falls, _dot(s.table, s.x[None]), -jnp.inf) / jnp.where(falls, rates, 1.0)
+    nearest = _largest(last)
     adding = independent & (height <= -nearest * length)
     empty = unfinished & ~passing & ~independent & (nearest == -jnp.inf)
-    chosen = jnp.where(adding, entering, first(last, nearest))
-    along = jnp.where(adding, rest, pick(s.table, chosen))
+    chosen = jnp.where(adding, entering, _first(last, nearest))
+    along = jnp.where(adding, rest, _pick(s.table, chosen))
 
     # Divisions are what XLA's CPU backend computes once and keeps; all else is computed again
     # for every entry of the table. So each factor of the update ends in one.
-    square = total(along * along)
+    square = _sum(along * along)
     square = jnp.where(square > 0, square, 1.0)
     inverse = jnp.where(unfinished & ~passing & ~empty, 1.0, 0.0) / square
     moves = inverse > 0
-    across = dot_rows(faces.normal, along[None])
-    of_active = jnp.where(adding, rates, dot_rows(s.table, along[None]))
+    across = _dot(faces.normal, along[None])
+    of_active = jnp.where(adding, rates, _dot(s.table, along[None]))
     change = jnp.where(s.active, of_active, jnp.where(adding, across, -across))
     change = jnp.where(moves, change, 0.0) / square
-    step = jnp.where(moves, jnp.where(adding, height, total(s.x * along)), 0.0) / square
+    step = jnp.where(moves, jnp.where(adding, height, _sum(s.x * along)), 0.0) / square
     swapped = chosen & moves
     table = s.table - change[:, None] * along[None]
     return _Working(
@@ -241,27 +265,64 @@ def _polished(faces: _Faces, found: _Working, active: Bool[Array, "m *b"]):
     gains as many digits as the dual basis has.
     """
     table = jnp.where(active[:, None], found.table, 0.0)
-    x = total(dot_rows(table, found.x[None])[:, None] * faces.normal)
+    x = _sum(_dot(table, found.x[None])[:, None] * faces.normal)
 
     def closer(_, x):
-        missed = jnp.where(active, dot_rows(faces.normal, x[None]) - faces.distance, 0.0)
-        return x - total(missed[:, None] * table)
+        missed = jnp.where(active, _dot(faces.normal, x[None]) - faces.distance, 0.0)
+        return x - _sum(missed[:, None] * table)
 
     x = repeat(2, closer, x)
-    weight = -dot_rows(table, x[None])
-    left = x + total(weight[:, None] * faces.normal)
-    return x, weight - dot_rows(table, left[None])
+    weight = -_dot(table, x[None])
+    left = x + _sum(weight[:, None] * faces.normal)
+    return x, weight - _dot(table, left[None])
 
 
 def _residual(faces: _Faces, x, weight, active: Bool[Array, "m *b"]) -> Float[Array, "*b"]:
     """The largest of: a face violated, an active one missed, a multiplier < 0, x + a' l."""
-    excess = dot_rows(faces.normal, x[None]) - faces.distance
+    excess = _dot(faces.normal, x[None]) - faces.distance
     missed = jnp.where(active, jnp.abs(excess), jnp.maximum(excess, 0.0))
-    size = faces.scale + jnp.sqrt(total(x * x))
+    size = faces.scale + jnp.sqrt(_sum(x * x))
     primal = jnp.where(faces.usable, missed, 0.0) / jnp.where(size > 0, size, 1.0)
-    most = largest(jnp.abs(weight))
-    dual = largest(-weight) / jnp.where(most > 0, most, 1.0)
+    most = _largest(jnp.abs(weight))
+    dual = _largest(-weight) / jnp.where(most > 0, most, 1.0)
     pulls = weight[:, None] * faces.normal
-    strongest = largest(total(jnp.abs(pulls)))
-    stationary = largest(jnp.abs(x + total(pulls))) / jnp.where(strongest > 0, strongest, 1.0)
-    return jnp.maximum(jnp.maximum(largest(primal), dual), stationary)
+    total = _largest(_sum(jnp.abs(pulls)))
+    stationary = _largest(jnp.abs(x + _sum(pulls))) / jnp.where(total > 0, total, 1.0)
+    return jnp.maximum(jnp.maximum(_largest(primal), dual), stationary)
+
+
+def _folded(operation, terms):
+    """Over the first axis, term by term: a reduction would go entry by entry."""
+    return functools.reduce(operation, [terms[i] for i in range(len(terms))])
+
+
+def _sum(terms):
+    return _folded(operator.add, terms)
+
+
+def _largest(terms):
+    return _folded(jnp.maximum, terms)
+
+
+def _any(terms):
+    return _folded(operator.or_, terms)
+
+
+def _dot(a, b):
+    """Sums over the second axis of a * b."""
+    return _sum([a[:, i] * b[:, i] for i in range(a.shape[1])])
+
+
+def _pick(table, one_hot):
+    """The row that is marked."""
+    return _sum([jnp.where(one_hot[i], table[i], 0.0) for i in range(len(table))])
+
+
+def _first(values, wanted):
+    """One-hot: the first entry that equals ``wanted``."""
+    found, before = [], jnp.zeros_like(wanted, bool)
+    for i in range(len(values)):
+        here = values[i] == wanted
+        found.append(here & ~before)
+        before = before | here
+    return jnp.stack(found)
