@@ -179,10 +179,8 @@ class Paper(NamedTuple):
         settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-13
         settings.tol_ktratio = 1e-10
         settings.max_iter = 500
-        A = sp.csc_matrix(np.vstack(rows))
-        found = clarabel.DefaultSolver(
-            sp.csc_matrix(np.triu(residual.T @ residual)), q, A, np.zeros(A.shape[0]), cones, settings
-        ).solve()  # fmt: skip
+        A, P = sp.csc_matrix(np.vstack(rows)), sp.csc_matrix(np.triu(residual.T @ residual))
+        found = clarabel.DefaultSolver(P, q, A, np.zeros(A.shape[0]), cones, settings).solve()
         assert str(found.status) in ("Solved", "AlmostSolved"), found.status
         return unit * np.array(found.x)[:n]
 

@@ -92,10 +92,7 @@ def worst_difference(seed, wide, gap, off=1.0):
     # gaps let a covariance grow, and its rounding stays: it is judged by the largest so far
     sizes = [np.max(np.abs(truth[0])), so_far(truth[1])]
     sizes += [np.max(np.abs(truth[0]) @ np.abs(s.C.T)), so_far(truth[3])]
-    return [
-        np.max(np.abs(a - b) / scale)
-        for a, b, scale in zip(found, truth, sizes, strict=True)
-    ]
+    return [np.max(np.abs(a - b) / scale) for a, b, scale in zip(found, truth, sizes, strict=True)]
 
 
 def check(seeds, wide):
@@ -105,10 +102,10 @@ def check(seeds, wide):
 
 
 def test_it_is_the_fixed_gain_filter():
-    """Three at their own size (small sizes are other code, `linalg.dot`), two of each kind at
+    """Two at their own size (small sizes are other code, `linalg.dot`), two of each kind at
     one size.
     """
-    check((1, 2, 4), wide=False)
+    check((1, 2), wide=False)
     check(range(2 * len(KINDS)), wide=True)
 
 
@@ -157,9 +154,14 @@ def test_the_h_infinity_gain():
     n, bound = len(s.A), 0.7
     P = s.Q
     for _ in range(2000):
-        P = s.A @ np.linalg.inv(
-            np.linalg.inv(P) + s.C.T @ np.linalg.solve(s.R, s.C) - np.eye(n) / bound**2
-        ) @ s.A.T + s.Q
+        P = (
+            s.A
+            @ np.linalg.inv(
+                np.linalg.inv(P) + s.C.T @ np.linalg.solve(s.R, s.C) - np.eye(n) / bound**2
+            )
+            @ s.A.T
+            + s.Q
+        )
     K = np.linalg.solve(s.C @ P @ s.C.T + s.R, s.C @ P).T
     built = decomposition.build(plant_of(s), s.x0, np.eye(n), bound=bound)
     kalman = decomposition.build(plant_of(s)).bank.K

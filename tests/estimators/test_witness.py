@@ -4,6 +4,8 @@ Rounding: recursions of 40 to 200 steps on errors of size 1, 1e-12; what is join
 more uncertain than it is (`witness.JITTER`).
 """
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -58,8 +60,9 @@ def recursion(watch, plant, P0, used):
     return whole
 
 
-@pytest.mark.parametrize(("plant", "members"), [(PLANT, SOME), (complex_plant(), ["y1", "y3"])],
-                         ids=["paper", "complex"])  # fmt: skip
+@pytest.mark.parametrize(("plant", "members"), [
+    (PLANT, SOME), pytest.param(complex_plant(), ["y1", "y3"], marks=pytest.mark.slow),
+], ids=["paper", "complex"])  # fmt: skip
 def test_the_joint_covariance(plant, members):
     """Against the recursion of the whole matrix; F [G; U'] = I, F W F' = P and Z' W Z = I."""
     m = len(plant.outputs)
@@ -67,21 +70,19 @@ def test_the_joint_covariance(plant, members):
     one = built(members, plant, P0)
     of = log(plant, np.zeros(m), STEPS)
     trusted = now_and_then(0.3, m=m)
-    state, got = followed(one, *of.all_seen, trusted)
+    state, _ = followed(one, *of.all_seen, trusted)
     used = trusted & np.isin(plant.outputs, members)
     watch, k = one.witness, 40
     whole = recursion(watch, plant, P0, used[: k + 1])
     found = joint(watch, state, k)
     np.testing.assert_allclose(found, whole, atol=1e-11 * np.max(np.abs(whole)))
 
-    from holdfast.estimators.witness import WitnessState
-
-    F, Z, P = watch.joined(WitnessState(*(a[k] for a in
-                           (state.witness.s, state.witness.P, state.witness.X))))  # fmt: skip
+    F, Z, P = watch.joined(jax.tree.map(lambda a: jnp.asarray(a[k]), state.witness))
     G = np.vstack([watch.G, np.asarray(watch.U).T])
     np.testing.assert_allclose(F @ G, np.eye(3), atol=1e-9)
     np.testing.assert_allclose(F @ whole @ F.T, P, atol=10 * JITTER)
-    np.testing.assert_allclose(Z.T @ whole @ Z, np.eye(Z.shape[1]), atol=1e-6)
+    # 1e-8 of s's variance is 2e-5 of what is left of it where the local estimates know better
+    np.testing.assert_allclose(Z.T @ whole @ Z, np.eye(Z.shape[1]), atol=1e-4)
     np.testing.assert_allclose(Z.T @ G, 0.0, atol=1e-8)
     # no better than the Kalman filter, which is best on the same samples
     assert np.trace(P) >= np.trace(np.asarray(one.fusion.P)) * (1 - 1e-7)
@@ -89,35 +90,30 @@ def test_the_joint_covariance(plant, members):
 
 @pytest.mark.slow
 def test_the_joint_covariance_is_that_of_the_errors():
-    """2000 runs with the same flags. An entry of a sample covariance is known to sqrt(2 / 2000)
-    = 3 % of the product of the scales; 5 of these, there being hundreds of entries."""
-    P0, runs, steps = np.diag([3.0, 2.0, 1.0]), 2000, 30
-    one, trusted = built(SOME, P0=P0, gamma=1e6), now_and_then(0.3, 30)
+    """2000 periods of ten rows with the same flags, after which nothing is remembered. An entry
+    of a sample covariance is known to sqrt(2 / 2000) = 3 % of the product of the scales; 5 of
+    these, there being hundreds of entries.
+    """
+    periods, length = 2000, 10
+    trusted = np.tile(now_and_then(0.4, length), (periods, 1))
+    one, of = built(SOME, gamma=1e6), log(PLANT, np.zeros(5), periods * length)
+    state, _ = followed(one, *of.all_seen, trusted)
+    last = slice(length - 1, None, length)
     G, U = np.asarray(one.witness.G), np.asarray(one.witness.U)
-    errors, last = [], None
-    rng = np.random.default_rng(9)
-    for run in range(runs):
-        of = log(PLANT, np.zeros(5), steps, seed=run)
-        # the truth starts at x0, drawn from the prior: the input is told as if it started at 0
-        off = np.asarray(PLANT.A) @ (rng.normal(size=3) * np.sqrt(np.diagonal(P0)))
-        moved = of.x.copy()
-        for k in range(steps):
-            moved[k] += off
-            off = np.asarray(PLANT.A) @ off
-        y = of.y + (moved - of.x) @ np.asarray(PLANT.C).T
-        last, _ = followed(one, of.u, y, np.ones(y.shape, bool), trusted)
-        x = moved[-1]
-        errors.append(np.r_[G @ x - last.zeta[-1], U.T @ x - last.witness.s[-1]])
-    assert last is not None
-    whole, errors = joint(one.witness, last, -1), np.array(errors)
+    errors = np.hstack([(of.x @ G.T - state.zeta)[last], (of.x @ U - state.witness.s)[last]])
+    errors, whole = errors[10:], joint(one.witness, state, -1)
     scale = np.sqrt(np.diagonal(whole))
-    found = errors.T @ errors / runs / np.outer(scale, scale)
-    np.testing.assert_allclose(found, whole / np.outer(scale, scale), atol=5 * np.sqrt(2 / runs))
-    # unbiased
-    assert np.all(np.abs(errors.mean(0)) < 5 * scale / np.sqrt(runs))
+    found = errors.T @ errors / len(errors) / np.outer(scale, scale)
+    correlation = whole / np.outer(scale, scale)
+    np.testing.assert_allclose(found, correlation, atol=5 * np.sqrt(2 / len(errors)))
+    # X is not small: one that is left out would be seen
+    assert np.max(np.abs(correlation[: len(G), len(G) :])) > 0.5
+    assert np.all(np.abs(errors.mean(0)) < 5 * scale / np.sqrt(len(errors)))
 
 
-@pytest.mark.parametrize("members", [["y2", "y3", "y5"], ["y1"]])
+@pytest.mark.parametrize("members", [
+    ["y2", "y3", "y5"], pytest.param(["y1"], marks=pytest.mark.slow),
+])  # fmt: skip
 def test_always_authenticated_is_the_kalman_filter_of_those(members):
     """The time-varying one, gaps included; y1 alone sees one state of three."""
     keep = [PLANT.outputs.index(name) for name in members]
@@ -169,8 +165,8 @@ def lie(size, trusted):
 
 def test_a_lie_until_the_sample_is_authenticated():
     """y2 lies by 1e6 whenever it can, more than the fusion withstands. All samples are
-    authenticated every fifth time: the error stays that of a filter with so few, 10 and less,
-    while the local estimates are wrong throughout."""
+    authenticated one time in five: the error is that of a filter with so few, of a mode that
+    doubles every row, while the local estimates are wrong throughout."""
     trusted = now_and_then(0.2, 200)
     found = {}
     for size in (1e3, 1e6):
@@ -183,7 +179,7 @@ def test_a_lie_until_the_sample_is_authenticated():
         without = estimates(built([]), *of.all_seen, trusted)
         assert np.max(np.abs(without.x - of.x)[50:]) > 0.1 * size
     print(f"largest error under a lie of 1e3 and of 1e6: {found[1e3]:.3g}, {found[1e6]:.3g}")
-    assert found[1e6] < 20
+    assert found[1e6] < 200
     assert found[1e6] < 1.1 * found[1e3]
 
 

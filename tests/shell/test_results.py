@@ -120,6 +120,7 @@ dt = 0.1
 kind = "secure_fusion"
 gamma = 2.0
 [detector]
+kind = "chi_square"
 threshold = 13.0
 """
 
@@ -136,7 +137,9 @@ def test_replay_names_the_lying_sensor(folder, command):
     code, out, err = command("replay", folder / "fusing.toml", folder / "fusing.csv")
     assert (code, err) == (0, "")
     rows = list(csv.DictReader(io.StringIO(out)))
-    a = np.array([[float(row[f"a:{n}"]) for n in ("gps", "wheel", "flow", "radar")] for row in rows])
+    a = np.array(
+        [[float(row[f"a:{n}"]) for n in ("gps", "wheel", "flow", "radar")] for row in rows]
+    )
     assert not np.any(a[:40])
     assert not np.any(a[:, 1:])
     # a sample and the estimate of the others, 0.3 and less each: 5 of them
