@@ -37,6 +37,8 @@ _PUBLIC = {
     "UnknownInput": "estimators.unknown_input",
     "Extended": "estimators.extended",
     "Unscented": "estimators.unscented",
+    "Decomposition": "estimators.decomposition",
+    "SecureFusion": "estimators.secure_fusion",
     "Monitor": "loop",
     "Scenario": "loop",
     "monitor_step": "loop",

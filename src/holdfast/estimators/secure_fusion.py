@@ -65,8 +65,8 @@ class Fusion(eqx.Module):
 class SecureFusionState(eqx.Module):
     """``f`` (m x d): the part of each local error that is put down to a lie, in the bank's
     coordinates; ``size`` (m,): what it changes, in standard deviations of the sharpest test;
-    ``suspected`` (m,);
-    ``residual``: the violation of the optimality conditions, ``pivots`` what the row took.
+    ``suspected`` (m,); ``residual``: the violation of the optimality conditions,
+    ``pivots`` what the row took.
     """
 
     zeta: Float[Array, " N"]
