@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from holdfast.attacks import bias, delay, freeze, hopping, noise, ramp, replay, sine
-from holdfast.controllers import feedback
+from holdfast.controllers import feedback, pole_placement
 from holdfast.detectors import (
     care_paper,
     chi_square,
@@ -22,12 +22,14 @@ from holdfast.estimators import (
     decomposition,
     extended,
     kalman,
+    l1_decoder,
+    l1_kalman,
     secure_fusion,
     unknown_input,
     unscented,
 )
 from holdfast.plants import build
-from holdfast.plants.library import bicycle, five_sensors, uav
+from holdfast.plants.library import bicycle, five_sensors, gps_imu, quadrotor, uav
 
 Builders = dict[str, Callable[..., Any]]
 
@@ -36,6 +38,8 @@ PLANTS: Builders = {
     "uav": uav.build,
     "bicycle": bicycle.build,
     "five_sensors": five_sensors.build,
+    "quadrotor": quadrotor.build,
+    "gps_imu": gps_imu.build,
 }
 
 ESTIMATORS: Builders = {
@@ -46,6 +50,8 @@ ESTIMATORS: Builders = {
     "unscented": unscented.build,
     "decomposition": decomposition.build,
     "secure_fusion": secure_fusion.build,
+    "l1_decoder": l1_decoder.build,
+    "l1_kalman": l1_kalman.build,
 }
 
 DETECTORS: Builders = {
@@ -71,6 +77,7 @@ ATTACKS: Builders = {
 
 CONTROLLERS: Builders = {
     "lqr": feedback.build,
+    "pole_placement": pole_placement.build,
 }
 
 SECTIONS: dict[str, Builders] = {

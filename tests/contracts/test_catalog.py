@@ -79,7 +79,10 @@ ATTACK_SETTINGS = {
     "delay": {"seconds": 0.4},
     "freeze": {},
 }
-CONTROLLER_SETTINGS = {"lqr": {"state_weight": [[1, 0], [0, 1]], "input_weight": [[1]]}}
+CONTROLLER_SETTINGS = {
+    "lqr": {"state_weight": [[1, 0], [0, 1]], "input_weight": [[1]]},
+    "pole_placement": {"poles": [[0.6, 0.1], [0.6, -0.1]]},
+}
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,8 @@
 """Linear state feedback from the estimate."""
 
+from dataclasses import replace
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
@@ -7,6 +10,7 @@ from jaxtyping import Array, Float
 
 from holdfast.numerics.linalg import dot
 from holdfast.parts import Controller, InvalidValue, Plant
+from holdfast.plants.constraints import Constraints, Polytope
 from holdfast.plants.linear import LinearPlant
 from holdfast.records import Estimate
 
@@ -44,19 +48,13 @@ def build(
     stabilise, or whose unstable modes ``state_weight`` does not see; for a weight of wrong
     shape or sign.
     """
-    if not (isinstance(plant, LinearPlant) and plant.constant):
-        raise InvalidValue("plant", "matrices that change", "a linear plant, A and B constant")
-    A, B = np.asarray(plant.A), np.asarray(plant.B)
+    _, A, B = steered(plant)
     n, nu = B.shape
-    if nu == 0:
-        raise InvalidValue("plant.B", "no inputs", "at least one input to steer with")
     states = _weight("state_weight", state_weight, n)
     inputs = _weight("input_weight", input_weight, nu)
     if np.linalg.eigvalsh(inputs)[0] <= 0:
         raise InvalidValue("input_weight", input_weight, "a positive definite matrix")
-    found = np.zeros(n) if reference is None else np.asarray(reference, float)
-    if found.shape != (n,) or not np.all(np.isfinite(found)):
-        raise InvalidValue("reference", reference, f"{n} finite numbers, one per state")
+    found = held(reference, n)
     stuck = _unreached(A, B)
     if stuck is not None:
         raise InvalidValue(
@@ -70,6 +68,76 @@ def build(
     S = scipy.linalg.solve_discrete_are(A, B, states, inputs)
     K = np.linalg.solve(inputs + B.T @ S @ B, B.T @ S @ A)
     return Feedback(jnp.asarray(K), jnp.asarray(found))
+
+
+def steered(plant: Plant) -> tuple[LinearPlant, np.ndarray, np.ndarray]:
+    """The plant, A (n x n) and B (n x nu) of a linear, constant plant with at least one input.
+
+    Raises `InvalidValue` for any other.
+    """
+    if not (isinstance(plant, LinearPlant) and plant.constant):
+        raise InvalidValue("plant", "matrices that change", "a linear plant, A and B constant")
+    A, B = np.asarray(plant.A), np.asarray(plant.B)
+    if B.shape[1] == 0:
+        raise InvalidValue("plant.B", "no inputs", "at least one input to steer with")
+    return plant, A, B
+
+
+def held(reference: list[float] | None, n: int) -> np.ndarray:
+    """The state to hold (n,): the origin unless given; `InvalidValue` where it is none."""
+    found = np.zeros(n) if reference is None else np.asarray(reference, float)
+    if found.shape != (n,) or not np.all(np.isfinite(found)):
+        raise InvalidValue("reference", reference, f"{n} finite numbers, one per state")
+    return found
+
+
+def closed_loop(plant: Plant, gain: Any) -> LinearPlant:
+    """The plant that an observer sees who is not told u, when u = -K x steers it: no inputs.
+
+        x_k = (A - B K) x_{k-1} + G d_{k-1} + w,   y_k = C x_k - D K x_{k-1} + H d_k + v
+
+    for ``gain`` K (nu x n): row k has the input computed from the true state before it, as in
+    a loop whose controller is not deceived; x is then the deviation from the reference. Where
+    D has columns other than zero, their inputs become states with the inputs' names, behind
+    the others: the outputs need what was applied, and x_{k-1} is no function of x_k.
+
+    Attacks, noises and limits are those of the plant. Whoever knows u should use the plant
+    itself: what this one hides may be seen there.
+
+    Raises `InvalidValue` for a plant that is not linear and constant or has no inputs, a gain
+    of another shape, and limits that move with the input.
+    """
+    plant, A, B = steered(plant)
+    K = np.asarray(gain, float)
+    if K.shape != B.shape[::-1] or not np.all(np.isfinite(K)):
+        raise InvalidValue("gain", f"shape {K.shape}", "finite numbers, {} x {}".format(*B.T.shape))
+    D = np.asarray(plant.D)
+    told = np.flatnonzero(np.any(D != 0.0, axis=0))
+    more = ((0, len(told)), (0, len(told)))
+    A = np.pad(A - B @ K, more)
+    A[len(K.T) :, : len(K.T)] = -K[told]
+    return replace(
+        plant,
+        A=jnp.asarray(A),
+        B=jnp.zeros((len(A), 0)),
+        C=jnp.asarray(np.hstack([np.asarray(plant.C), D[:, told]])),
+        D=jnp.zeros((len(D), 0)),
+        G=jnp.pad(jnp.asarray(plant.G), (more[0], (0, 0))),
+        Q=jnp.pad(jnp.asarray(plant.Q), more),
+        constraints=Constraints(
+            _unmoved(plant.constraints.state, len(told)), _unmoved(plant.constraints.attack, 0)
+        ),
+        states=(*plant.states, *(plant.inputs[i] for i in told)),
+        inputs=(),
+    )
+
+
+def _unmoved(limits: Polytope, more: int) -> Polytope:
+    """The limits of a plant without inputs, and with so many more states that have none."""
+    if np.any(np.asarray(limits.bound_u) != 0.0):
+        raise InvalidValue("plant.constraints", "a bound that moves with u", "bounds without u")
+    matrix = jnp.pad(limits.matrix, [*[(0, 0)] * (limits.matrix.ndim - 1), (0, more)])
+    return Polytope(matrix, limits.bound, limits.bound_u[..., :0])
 
 
 def _weight(key: str, value: list[list[float]], size: int) -> np.ndarray:

@@ -223,6 +223,8 @@ _WORDS = {float: "a number", int: "a whole number", bool: "true or false", str: 
 
 
 def _plural(annotation: Any) -> str:
+    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
+        return " or ".join(map(_plural, typing.get_args(annotation)))
     if _is_list(annotation):
         inside = typing.get_args(annotation)
         return f"lists of {_plural(inside[0])}" if inside else "lists"

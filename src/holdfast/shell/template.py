@@ -104,16 +104,15 @@ def scenario_text(kind: str | None) -> str:
     notes = {"x0": "estimate one sample before the first row", "P0": "and its covariance"}
     build = SECTIONS["estimator"][kinds["estimator"]]
     parts = [HEAD, plant_text, _table("estimator", kinds["estimator"], build, 1, start, notes)]
-    values = {
-        "detector": {"level": 0.01, "on": judged(estimator)},
-        "controller": _weights(plant),
-        "attack": {},
+    values: dict[str, Callable[..., dict[str, Any]]] = {
+        "detector": lambda _: {"level": 0.01, "on": judged(estimator)},
+        "controller": lambda build: _steering(build, plant),
+        "attack": lambda build: _injection(build, plant, example.get("channel")),
     }
     for section, given in values.items():
         if section in kinds:
             build = SECTIONS[section][kinds[section]]
-            given = given or _injection(build, plant, example.get("channel"))
-            parts.append(_table(section, kinds[section], build, 1, given))
+            parts.append(_table(section, kinds[section], build, 1, given(build)))
     return "\n".join([*parts, RUN])
 
 
@@ -135,9 +134,16 @@ def _start(plant: Plant) -> dict[str, Any]:
     return {"x0": [0.0] * n, "P0": _identity(n)}
 
 
-def _weights(plant: Plant) -> dict[str, Any]:
-    sizes = {"state_weight": len(plant.states), "input_weight": len(plant.inputs)}
-    return {name: _identity(size) for name, size in sizes.items()}
+def _steering(build: Callable[..., Any], plant: Plant) -> dict[str, Any]:
+    """What a controller needs: weights, or where the poles are to be."""
+    n = len(plant.states)
+    given = {
+        "state_weight": _identity(n),
+        "input_weight": _identity(len(plant.inputs)),
+        "poles": [round(0.9 - 0.4 * i / n, 3) for i in range(n)],
+    }
+    fields = model_of(build, 1).model_fields
+    return {name: value for name, value in given.items() if name in fields}
 
 
 def _injection(build: Callable[..., Any], plant: Plant, channel: str | None) -> dict[str, Any]:
