@@ -39,6 +39,8 @@ _PUBLIC = {
     "Unscented": "estimators.unscented",
     "Decomposition": "estimators.decomposition",
     "SecureFusion": "estimators.secure_fusion",
+    "L1Decoder": "estimators.l1_decoder",
+    "L1Kalman": "estimators.l1_kalman",
     "Monitor": "loop",
     "Scenario": "loop",
     "monitor_step": "loop",

@@ -27,9 +27,9 @@ from holdfast.estimators.decoder_keys import (
     honest,
 )
 from holdfast.estimators.decoder_window import DecoderWindow, Problem, Rows, decoder_window
-from holdfast.numerics.group_regression import group_regression
+from holdfast.numerics.group_regression import group_of_reduced
 from holdfast.numerics.l0_regression import l0_regression
-from holdfast.numerics.l1_regression import l1_of_reduced, l1_regression
+from holdfast.numerics.l1_regression import l1_of_reduced
 from holdfast.numerics.linalg import dot
 from holdfast.numerics.reduced import Reduced, reduced
 from holdfast.numerics.spread import errors, influence, of_signs, signs
@@ -116,9 +116,7 @@ class L1Decoder(Estimator):
         nothing = jnp.zeros(p), jnp.zeros((p, p)), 0
         return state, Estimate.without_attack(self.x0, self.P0, *nothing, a=jnp.zeros(p))
 
-    def step(
-        self, state: DecoderState, observation: Observation
-    ) -> tuple[DecoderState, Estimate]:
+    def step(self, state: DecoderState, observation: Observation) -> tuple[DecoderState, Estimate]:
         """One row: the window moved on, and decoded once it is full."""
         rows, m = self.window.add(state.rows, state.x, observation)
         moved = dot(m.A, state.x) + rows.push[-1]
@@ -187,7 +185,7 @@ class L1Decoder(Estimator):
         if self.norm == "l1":
             found = l1_of_reduced(rows, Phi, target, weight, exact)
         else:
-            found = group_regression(Phi, target, self._sensors(), self.norm, weight, exact)
+            found = group_of_reduced(rows, Phi, target, self._sensors(), self.norm, weight, exact)
         relative = found.gap / jnp.where(found.objective > 0, found.objective, 1.0)
         # noise-free samples leave nothing but rounding to minimise
         size = ROUNDING * jnp.sum(weight * jnp.abs(target))
@@ -216,10 +214,9 @@ class L1Decoder(Estimator):
     def _fewest(self, problem: Problem, sd, weight) -> Decoded:
         Phi, target = problem.laid.Phi, problem.target
         units = range(len(Phi)) if self.positions == "hopping" else self._sensors()
-        guess = l1_regression(Phi, target, weight, problem.trusted & problem.seen)
         found = l0_regression(
             Phi, target, tuple(units), self.threshold * sd, problem.seen, problem.trusted,
-            states=LISTED, nodes=self.nodes, start=guess.x,
+            states=LISTED, nodes=self.nodes,
         )  # fmt: skip
         several = jnp.where(found.found > 1, int(Status.AMBIGUOUS), 0)
         proved = found.feasible & found.complete & (found.lower == found.count)
@@ -251,9 +248,7 @@ class L1Decoder(Estimator):
         law = laid.law
         if self.norm == "l1":
             law = jax.lax.cond(jnp.any(loose), after_exact, lambda: laid.law)
-        said = errors(
-            laid.Phi, laid.last, laid.noise, law, found.lead, found.gain, found.pulled, p
-        )
+        said = errors(laid.Phi, laid.last, laid.noise, law, found.lead, found.gain, found.pulled, p)
         lost = lost | ~found.known
         x_cov = jnp.where(lost[:, None] | lost, 0.0, said.x)
         x_cov = x_cov + jnp.diag(jnp.where(lost, jnp.inf, 0.0))
@@ -296,6 +291,7 @@ def build(
 ) -> L1Decoder:
     """The decoder over the last ``window`` rows (as many as there are states, unless told).
 
+    ``x0``, ``P0`` (zero and the identity, unless told) are what is said before the first row.
     ``norm``: "l1", for attacks that hop between sensors; "l1l2" and "l1linf", a norm per sensor
     over the window, for attacked sensors that stay the same; "l0", the exact search for the
     fewest attacked samples (``positions`` "hopping", the default) or sensors ("fixed"), of at
@@ -313,7 +309,7 @@ def build(
     if rows.laid is not None and not np.all(np.isfinite(np.asarray(rows.laid.noise.cov))):
         raise InvalidValue("window", window, "a window in which A's powers stay finite")
     x0 = jnp.zeros(n) if x0 is None else jnp.asarray(x0, float)
-    P0 = jnp.diag(jnp.full(n, jnp.inf)) if P0 is None else jnp.asarray(P0, float)
+    P0 = jnp.eye(n) if P0 is None else jnp.asarray(P0, float)
     return L1Decoder(
         plant, rows, x0, P0, jnp.asarray(threshold, float), norm, weights,
         positions or "hopping", int(nodes),

@@ -13,6 +13,8 @@ import equinox as eqx
 from holdfast import __version__
 from holdfast.campaign.calibrate import Calibration, calibrated, content_key, from_log, with_value
 from holdfast.estimators.care import Care
+from holdfast.estimators.l1_decoder import L1Decoder
+from holdfast.estimators.l1_kalman import L1Kalman
 from holdfast.estimators.secure_fusion import SecureFusion
 from holdfast.estimators.unknown_input import UnknownInput
 from holdfast.loop import Monitor, Scenario
@@ -59,18 +61,20 @@ def calibrated_scenario(found: ScenarioFile) -> tuple[Scenario, Calibration]:
     return eqx.tree_at(lambda s: s.monitor, found.scenario, monitor), how
 
 
-def relinearised(monitor: Monitor) -> bool:
-    """Whether every row of every run is linearised several times, which is dear to simulate."""
+def dear(monitor: Monitor) -> str | None:
+    """Why a row costs a thousand times what a Kalman filter's does; None if it does not."""
     estimator = monitor.estimator
-    return isinstance(estimator, UnknownInput | Care) and not isinstance(
-        estimator.plant, LinearPlant
-    )
+    if isinstance(estimator, L1Decoder | L1Kalman):
+        return "a window is decoded at every row of every run"
+    if isinstance(estimator, UnknownInput | Care) and not isinstance(estimator.plant, LinearPlant):
+        return "a nonlinear plant is linearised up to six times at every row of every run"
+    return None
 
 
 def _runs(monitor: Monitor) -> int | None:
     """Fewer runs where a row costs ten to a thousand times what a Kalman filter's does."""
     estimator = monitor.estimator
-    if relinearised(monitor):
+    if dear(monitor):
         runs = DEAR_RUNS
     elif isinstance(estimator, SecureFusion):
         runs = COSTLY_RUNS if estimator.quick else DEAR_RUNS

@@ -20,7 +20,7 @@ from holdfast.parts import InvalidValue
 from holdfast.plants.linear import LinearPlant
 from holdfast.records import Trace
 from holdfast.shell import runtime
-from holdfast.shell.calibrating import busy, calibrated_scenario, relinearised
+from holdfast.shell.calibrating import busy, calibrated_scenario, dear
 from holdfast.shell.errors import InputError
 from holdfast.shell.logs import read_log
 from holdfast.shell.reading import STANDARD_INPUT
@@ -192,10 +192,11 @@ def _blind_spots(scenario: loop.Scenario) -> tuple[list[str], list[str]]:
     from holdfast.campaign.blindness import blindness
 
     plant, estimator = scenario.plant, scenario.monitor.estimator
-    if relinearised(scenario.monitor):
+    reason = dear(scenario.monitor)
+    if reason:
         return [], [
-            "What the detector cannot see was not simulated: a nonlinear plant is linearised up to "
-            "six times at every row of every run. holdfast.campaign.blindness does it, in minutes."
+            f"What the detector cannot see was not simulated: {reason}. "
+            "holdfast.campaign.blindness does it, in minutes."
         ]
     constant = isinstance(plant, LinearPlant) and plant.schedule is None
     shared = constant and isinstance(estimator, Kalman | UnknownInput)
