@@ -1,22 +1,22 @@
 """An analysis in sentences: what is missing, and what would help."""
 
-from collections.abc import Iterable
-
 import numpy as np
 
 from holdfast.analysis.attacks import Channel
+from holdfast.analysis.decoding_advice import on_decoding
 from holdfast.analysis.fusion import CERTAIN, Fusion
 from holdfast.analysis.whole import Analysis
+from holdfast.analysis.wording import between, combination, either, joined, listed, steps
 from holdfast.analysis.zeros import Zero
 
-SHOWN = 3
-"""Names that a sentence lists."""
 
-
-def advice(found: Analysis, delay: int | None, fusion: bool = False) -> list[str]:
+def advice(
+    found: Analysis, delay: int | None, fusion: bool = False, decoding: bool = False
+) -> list[str]:
     """The sentences, most basic first; ``delay`` is the estimator's, None where it has none.
 
-    ``fusion``: whether to say what the fusion of local estimates withstands.
+    ``fusion``: whether to say what the fusion of local estimates withstands; ``decoding``:
+    what the decoders of a window correct.
     """
     said = [f"This holds for {found.model.note}."] if found.model.note else []
     said += _on_state(found)
@@ -28,6 +28,8 @@ def advice(found: Analysis, delay: int | None, fusion: bool = False) -> list[str
     said += _on_window(found)
     if fusion:
         said += _on_fusion(found.fusion)
+    if decoding:
+        said += on_decoding(found.decoding, found.model.states)
     return said
 
 
@@ -35,9 +37,9 @@ def _on_state(found: Analysis) -> list[str]:
     said = []
     if not found.observability.observable:
         hidden = [combination(v, found.model.states) for v in found.observability.hidden.T]
-        text = f"The outputs do not determine the state: {_listed(hidden)} reaches none of them"
+        text = f"The outputs do not determine the state: {listed(hidden)} reaches none of them"
         sensors = found.observability.sensors
-        said.append(f"{text}; measure {_either(sensors)} and they do." if sensors else f"{text}.")
+        said.append(f"{text}; measure {either(sensors)} and they do." if sensors else f"{text}.")
     if found.steady.reason is not None:
         said.append(f"There is no steady-state Kalman filter: {found.steady.reason}.")
     return said
@@ -51,13 +53,13 @@ def _on_channel(channel: Channel) -> list[str]:
     if delay is None:
         text, link = f"{name} is never identified: {channel.reason}", ";"
     else:
-        text = f"{name} reaches the outputs only after {_steps(delay)}: set delay = {delay}"
+        text = f"{name} reaches the outputs only after {steps(delay)}: set delay = {delay}"
         link = ", or"
     if not best:
         return [f"{text}."]
     soonest = channel.sensors[0].delay
-    when = f"after {_steps(soonest)}" if soonest else "at once"
-    return [f"{text}{link} measure {_either(best)} and it is identified {when}."]
+    when = f"after {steps(soonest)}" if soonest else "at once"
+    return [f"{text}{link} measure {either(best)} and it is identified {when}."]
 
 
 def _on_what_hides(found: Analysis) -> list[str]:
@@ -72,9 +74,7 @@ def _on_what_hides(found: Analysis) -> list[str]:
     for zero in (zero for zero in unstable if zero.z.imag >= 0):
         said += _on_zero(zero, found)
     if attacks.shields and any(np.any(zero.attack) for zero in unstable):
-        said.append(
-            f"Measure {_either(attacks.shields)} and nothing that lasts can hide like that."
-        )
+        said.append(f"Measure {either(attacks.shields)} and nothing that lasts can hide like that.")
     return said
 
 
@@ -85,10 +85,10 @@ def _on_zero(zero: Zero, found: Analysis) -> list[str]:
     channels = [combination(v, found.model.attacks) for v in zero.attack[:, used].T]
     said = []
     if states:
-        said.append(f"Without any attack, {_joined(states, 'or')} can move by the mode {z} unseen.")
+        said.append(f"Without any attack, {joined(states, 'or')} can move by the mode {z} unseen.")
     if channels:
         said.append(
-            f"An attack on {_joined(channels, 'or')} that goes like ({z})^k hides behind an "
+            f"An attack on {joined(channels, 'or')} that goes like ({z})^k hides behind an "
             "initial state that is not known exactly (invariant zero): it is identified "
             "without bias, but its error does not fade."
         )
@@ -112,12 +112,12 @@ def _on_bounds(found: Analysis) -> list[str]:
     said = []
     if grown:
         said.append(
-            f"With delay = {last.delay} the variance of the estimate of {_listed(grown)} grows "
+            f"With delay = {last.delay} the variance of the estimate of {listed(grown)} grows "
             f"without limit: it still did after {last.steps} steps."
         )
     if unsure:
         said.append(
-            f"With delay = {last.delay} the variance of the estimate of {_listed(unsure)} had "
+            f"With delay = {last.delay} the variance of the estimate of {listed(unsure)} had "
             f"not settled after {last.steps} steps."
         )
     return said
@@ -128,7 +128,7 @@ def _on_window(found: Analysis) -> list[str]:
     if window is None:
         return []
     rows = f"the first {window.rows} determine" if window.rows else "all together do not determine"
-    said = [f"Of the {_steps(window.steps)} looked at, {rows} the state."]
+    said = [f"Of the {steps(window.steps)} looked at, {rows} the state."]
     for name, count in window.undetermined.items():
         if count:
             said.append(f"{name} is not determined by its own row at {count} of {window.steps}.")
@@ -166,12 +166,12 @@ def _on_liars(found: Fusion) -> list[str]:
     said = []
     if heavy:
         said.append(
-            f"Under the LASSO fusion this plant cannot afford a lie of {_joined(heavy, 'or')}: "
+            f"Under the LASSO fusion this plant cannot afford a lie of {joined(heavy, 'or')}: "
             "from a ratio of 1 a sensor can outweigh all others and be believed, however far "
             "it lies."
         )
     if unsure:
-        said.append(f"Whether the LASSO fusion bounds a lie of {_listed(unsure)} is not known.")
+        said.append(f"Whether the LASSO fusion bounds a lie of {listed(unsure)} is not known.")
     return said
 
 
@@ -183,54 +183,9 @@ def _on_remedies(found: Fusion) -> list[str]:
     ):
         names = [f'"{r.name}" (ratio {between(r.lower, r.upper)})' for r in remedies if r.enough]
         if names:
-            said.append(f"{text.format(_joined(names, 'or'))}.")
+            said.append(f"{text.format(joined(names, 'or'))}.")
     if not said and found.untried:
         said.append("What would mend that was too dear to try.")
     elif not said:
         said.append("No single sensor, authenticated or added, mends that.")
     return said
-
-
-def between(lower: float, upper: float) -> str:
-    """A ratio that lies between two bounds."""
-    if lower == np.inf:
-        return "infinite"
-    if upper == np.inf:
-        return f"over {lower:.3g}"
-    ends = f"{lower:.3g}", f"{upper:.3g}"
-    return ends[0] if ends[0] == ends[1] else f"{ends[0]} to {ends[1]}"
-
-
-def combination(vector: np.ndarray, names: Iterable[str]) -> str:
-    """A direction in words: the largest entry taken as 1, what is under 1e-6 of it left out.
-
-    The sign is such that the first name has none.
-    """
-    vector = vector / vector[np.argmax(np.abs(vector))]
-    first = vector[np.abs(vector) > 1e-6][0]
-    text = ""
-    for value, name in zip(-vector if first.real < 0 else vector, names, strict=True):
-        if abs(value) <= 1e-6:
-            continue
-        real = abs(value.imag) <= 1e-6 * abs(value)
-        size = f"{abs(value):.3g} " if real else f"({value:.3g}) "
-        minus = real and value.real < 0
-        text += (" - " if minus else " + ") * bool(text) + ("" if size == "1 " else size) + name
-    return text
-
-
-def _steps(count: int) -> str:
-    return f"{count} step{'s' if count != 1 else ''}"
-
-
-def _either(names: Iterable[str]) -> str:
-    return _joined([f'"{name}"' for name in names], "or")
-
-
-def _listed(names: Iterable[str]) -> str:
-    return _joined(list(names), "and")
-
-
-def _joined(names: list[str], word: str) -> str:
-    shown = names[:SHOWN] + ([f"{len(names) - SHOWN} more"] if len(names) > SHOWN else [])
-    return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} {word} {shown[-1]}"

@@ -1,17 +1,15 @@
 """How many lying sensors the LASSO fusion of local estimates withstands, and which ones."""
 
-import itertools
-import math
 from typing import NamedTuple
 
 import numpy as np
 
 from holdfast.analysis.model import Model
+from holdfast.analysis.supports import sparse_observable
 from holdfast.numerics.local import Local, Unfit, decompose
 from holdfast.numerics.ratio_bounds import Component
 from holdfast.numerics.rays import MOST, affordable, components, worst
 from holdfast.numerics.steady_state import SteadyState, steady_state
-from holdfast.numerics.subspaces import TOLERANCE, kernel, modes, scaled
 
 CERTAIN = 1.0 - 1e-9
 """A ratio from which on nothing is certain."""
@@ -21,8 +19,6 @@ DEAREST = 30_000
 """The same for sensors times states squared: some five seconds."""
 ILL = 1e6
 """Condition of the paper's coordinates from which they are called ill-conditioned."""
-SUBSETS = 20_000
-"""Sets of sensors that are tried for a repeated eigenvalue."""
 
 
 class Remedy(NamedTuple):
@@ -101,7 +97,7 @@ def fusion(model: Model, steady: SteadyState) -> Fusion:
         return Fusion(str(reason))
     most = max(1, (m - 1) // 2)
     ratios = worst(components(*_paper(local)), m, most)
-    known = _sparse_observable(model)
+    known = sparse_observable(model)
     fails = np.arange(1, most + 1) > (most if known is None else known)
     lower_sets = np.where(fails, np.maximum(ratios.lower_sets, 1.0), ratios.lower_sets)
     limit = MOST / (m + n)
@@ -170,29 +166,3 @@ def _remedy(name: str, found: list[Component], sensors: int, limit: float) -> Re
 def _ranked(remedies: list[Remedy | None]) -> tuple[Remedy, ...]:
     tried = [remedy for remedy in remedies if remedy is not None]
     return tuple(sorted(tried, key=lambda remedy: (remedy.upper, remedy.lower)))
-
-
-def _sparse_observable(model: Model) -> int | None:
-    """The largest p such that the state stays observable without any 2 p sensors.
-
-    A sensor is of no use for a mode if it does not see its eigenvector; of a repeated
-    eigenvalue, the eigenvector that the fewest sensors see. None if too dear.
-    """
-    n, m = len(model.A), len(model.C)
-    s = scaled(model.A, np.zeros((n, 0)), model.C, np.zeros((m, 0)))
-    fewest = m
-    for z, _ in modes(s.A):
-        off = s.A - z * np.eye(n)
-        space = kernel(off, s.size)
-        # an eigenvalue as computed has an eigenvector, whatever rounding says
-        space = space if space.shape[1] else np.linalg.svd(off)[2][-1:].conj().T
-        seen, r = s.C @ space, space.shape[1]
-        if kernel(seen).shape[1]:
-            return 0
-        count = math.comb(m, r - 1)
-        if count > SUBSETS:
-            return None
-        sets = np.reshape(list(itertools.combinations(range(m), r - 1)), (count, r - 1))
-        hidden = np.linalg.svd(seen[sets.astype(int)], full_matrices=True)[2][:, -1].conj()
-        fewest = min(fewest, int(np.min(np.sum(np.abs(seen @ hidden.T) > TOLERANCE, 0))))
-    return max(0, (fewest - 1) // 2)

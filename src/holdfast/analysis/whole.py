@@ -9,6 +9,8 @@ from holdfast.analysis.boundedness import Bounds, bounds
 from holdfast.analysis.fusion import Fusion, fusion
 from holdfast.analysis.model import Model, model_at, models_over
 from holdfast.analysis.observability import Observability, observability, rows_until_observable
+from holdfast.analysis.remedies import Decoding, decoding
+from holdfast.analysis.windows import noise_weights
 from holdfast.numerics.steady_state import SteadyState, steady_state
 from holdfast.parts import Plant
 from holdfast.plants.linear import LinearPlant
@@ -27,7 +29,8 @@ class Window(NamedTuple):
 
 class Analysis(NamedTuple):
     """``bounds``: at delay 0 and at the smallest delay that identifies what can be; none
-    without attack channels. ``window``: only for per-step matrices.
+    without attack channels. ``window``: only for per-step matrices. ``decoding``: of the
+    decoders' window, whatever the estimator is.
     """
 
     model: Model
@@ -37,24 +40,39 @@ class Analysis(NamedTuple):
     bounds: tuple[Bounds, ...]
     window: Window | None
     fusion: Fusion
+    decoding: Decoding
 
 
-def analysis(plant: Plant, x0: np.ndarray, P0: np.ndarray) -> Analysis:
-    """What can be said of ``plant`` near ``x0`` (n,), starting from the covariance ``P0``."""
+def analysis(
+    plant: Plant,
+    x0: np.ndarray,
+    P0: np.ndarray,
+    window: int | None = None,
+    trusted: tuple[int, ...] = (),
+    weighted: bool = False,
+) -> Analysis:
+    """What can be said of ``plant`` near ``x0`` (n,), starting from the covariance ``P0``.
+
+    ``window``: steps that a decoder looks at, n if there is none; ``trusted``: outputs that are
+    always authenticated; ``weighted``: whether it divides each sample by its deviation.
+    """
     model = model_at(plant, x0)
+    window = len(model.A) if window is None else window
+    weight = noise_weights(model, window) if weighted else None
     attacks = identifiability(model)
     delays = sorted({0, attacks.delay}) if model.attacks else []
     steady = steady_state(model.A, model.C, model.Q, model.R)
-    window = None
+    over = None
     if isinstance(plant, LinearPlant) and plant.steps is not None:
         models = models_over(plant, x0)
-        window = Window(len(models), rows_until_observable(models), undetermined_steps(models))
+        over = Window(len(models), rows_until_observable(models), undetermined_steps(models))
     return Analysis(
         model,
         observability(model),
         steady,
         attacks,
         tuple(bounds(model, P0, delay) for delay in delays),
-        window,
+        over,
         fusion(model, steady),
+        decoding(model, window, trusted, weight),
     )

@@ -24,6 +24,8 @@ OVERHEAD = 1e5
 """Multiplications that take as long as what comes with every round."""
 STEPS = 40
 """Steps of an ascent."""
+TRIED = 24
+"""Ascents for one number of blocks, at most."""
 KINK = 1e-10
 """Norm of a part, relative to the largest, that the ascent takes for zero."""
 INFINITE = 1e10
@@ -62,7 +64,8 @@ class Component(NamedTuple):
 class Ratios(NamedTuple):
     """Bounds of the ratio of each block alone (m,), and of the worst set of 1, 2, .. blocks.
 
-    Infinite where nothing is left of the others; equal bounds are exact.
+    Infinite where nothing is left of the others; equal bounds are exact. Where the blocks are
+    counted by steps, the sets have 1, 2, .. blocks of each.
     """
 
     lower: np.ndarray
@@ -95,10 +98,18 @@ def single(g: np.ndarray) -> np.ndarray:
     return _over_rest(g, np.sum(g, 1, keepdims=True))
 
 
-def largest(g: np.ndarray, most: int) -> np.ndarray:
-    """The sum of the 1, 2, .. ``most`` largest over that of the others: (k x most)."""
-    ordered = np.cumsum(-np.sort(-g, 1), 1)
+def largest(g: np.ndarray, most: int, steps: int = 1) -> np.ndarray:
+    """The sum of the 1, 2, .. ``most`` largest of each step over that of the others: (k x most).
+
+    The blocks of g (k x m) are ``steps`` runs of equal length.
+    """
+    ordered = gathered(g, steps)
     return _over_rest(ordered[:, :most], ordered[:, -1:])
+
+
+def gathered(g: np.ndarray, steps: int = 1) -> np.ndarray:
+    """The sum of the 1, 2, .. largest of each step, for g (k x m): (k x m / steps)."""
+    return np.sum(np.cumsum(-np.sort(-g.reshape(len(g), steps, -1), 2), 2), 1)
 
 
 def _over_rest(of: np.ndarray, total: np.ndarray) -> np.ndarray:
@@ -136,9 +147,14 @@ def fixed(sets: np.ndarray) -> Callable:
     return lambda g: sets
 
 
-def top(count: np.ndarray) -> Callable:
-    """For `climb`: the ``count`` (k,) largest blocks."""
-    return lambda g: np.argsort(np.argsort(-g, 1), 1) < count[:, None]
+def top(count: np.ndarray, steps: int = 1) -> Callable:
+    """For `climb`: the ``count`` (k,) largest blocks of each step."""
+
+    def choose(g: np.ndarray) -> np.ndarray:
+        order = np.argsort(np.argsort(-g.reshape(len(g), steps, -1), 2), 2)
+        return (order < count[:, None, None]).reshape(g.shape)
+
+    return choose
 
 
 def effort(part: Component) -> float:
@@ -148,12 +164,14 @@ def effort(part: Component) -> float:
     return N * (4.0 * r * r * blocks + (4.0 * r + NORM) * N) + OVERHEAD * blocks
 
 
-def bounded(part: Component, most: int, work: float) -> Ratios:
+def bounded(part: Component, most: int, work: float, steps: int = 1) -> Ratios:
     """An interval for each block alone and for the worst sets of up to ``most`` blocks.
 
     ``work``: multiplications that the certificates of the blocks may take, about, those of
-    the sets, and the ascents.
+    the sets, and the ascents. With several ``steps`` nothing is said of a block alone.
     """
+    if steps > 1:
+        return _bounded_by_steps(part, most, work, steps)
     m, (N, _, r) = part.blocks, part.parts.shape
     step = STEPS * 2.0 * N * r * (r + NORM / 2)
     best = _climbed(part, int(np.clip(work / (step * m), 1, 3 * r)))
@@ -170,6 +188,23 @@ def bounded(part: Component, most: int, work: float) -> Ratios:
     lower_sets = np.max(largest(g, most), 0)
     upper_sets = np.maximum(_certified_sets(part, upper, most, work), lower_sets)
     return Ratios(lower, upper, lower_sets, upper_sets)
+
+
+def _bounded_by_steps(part: Component, most: int, work: float, steps: int) -> Ratios:
+    """The sets of up to ``most`` blocks of each step; the ascents start at the best of many u."""
+    m, (N, _, r) = part.blocks, part.parts.shape
+    # no randomness is needed: the cosines of squares are spread well enough
+    mixed = np.cos(np.arange(TRIED * r * r) ** 2.0).reshape(-1, r)
+    tried = np.concatenate([np.eye(r), part.parts[:, 0], mixed])
+    g = part.sums(tried)
+    starts = int(np.clip(work / (STEPS * 2.0 * N * r * (r + NORM / 2) * most), 1, TRIED))
+    order = np.argsort(-largest(g, most, steps), 0)[:starts]
+    count = np.repeat(np.arange(1, most + 1), len(order))
+    ends = climb(part, tried[order.T.ravel()], top(count, steps), STEPS)
+    lower_sets = np.max(largest(np.concatenate([g, part.sums(ends)]), most, steps), 0)
+    unknown = np.full(m, np.inf)
+    upper_sets = np.maximum(_certified_sets(part, unknown, most, work, steps), lower_sets)
+    return Ratios(np.zeros(m), unknown, lower_sets, upper_sets)
 
 
 def _climbed(part: Component, starts: int) -> np.ndarray:
@@ -194,27 +229,34 @@ def _certified_alone(part: Component, own: np.ndarray, rounds: int) -> float:
     return _certified(part.parts[own], part.parts[~own], one, 1, rounds) if own.any() else 0.0
 
 
-def _certified_sets(part: Component, upper: np.ndarray, most: int, work: float) -> np.ndarray:
+def _certified_sets(
+    part: Component, upper: np.ndarray, most: int, work: float, steps: int = 1
+) -> np.ndarray:
     """For the worst sets: from the bounds of the blocks alone, and from all rows at once."""
     finite = np.where(np.isinf(upper), 0.0, upper)
     shares = np.where(np.isinf(upper), 1.0, finite / (1.0 + finite))
-    share = np.cumsum(-np.sort(-shares))[:most]
+    share = gathered(shares[None], steps)[0, :most]
     member, (N, _, r) = part.member.astype(float), part.parts.shape
     cost = N * (4.0 * r * r + (4.0 * r + NORM) * N) + OVERHEAD
     rounds = int(np.clip(work / (cost * most), FEW, ROUNDS))
-    for p in range(2, min(most, 1 + int(work / (cost * rounds))) + 1):
-        at_once = _certified(part.parts, part.parts, member, p, rounds)
+    # of one block alone more is known
+    first = 2 if steps == 1 else 1
+    for p in range(first, min(most, 1 + int(work / (cost * rounds))) + 1):
+        at_once = _certified(part.parts, part.parts, member, p, rounds, steps)
         share[p - 1] = min(share[p - 1], at_once)
         if share[p - 1] >= 1.0:
             break
     below = np.where(share < 1.0, share, 0.0)
     ratio = np.where(share < 1.0, below / (1.0 - below), np.inf)
-    ratio[0] = np.max(upper)
+    if steps == 1:
+        ratio[0] = np.max(upper)
     return np.minimum.accumulate(ratio[::-1])[::-1]
 
 
-def _certified(R: np.ndarray, T: np.ndarray, member: np.ndarray, p: int, rounds: int) -> float:
-    """A bound of (the p largest of: sum of |R_j u| over a block) / sum of |T_k u|.
+def _certified(
+    R: np.ndarray, T: np.ndarray, member: np.ndarray, p: int, rounds: int, steps: int = 1
+) -> float:
+    """A bound of (the p largest of each step of: sum of |R_j u| over a block) / sum of |T_k u|.
 
     R (J x 2 x r), T (N x 2 x r), ``member`` (J x blocks).
     """
@@ -228,7 +270,7 @@ def _certified(R: np.ndarray, T: np.ndarray, member: np.ndarray, p: int, rounds:
         root = np.repeat(np.sqrt(weight), 2)
         q, triangle = np.linalg.qr(rest * root[:, None])
         X = np.linalg.solve(triangle.T, flat.T).T @ q.T * root
-        columns = _columns(X, member, p)
+        columns = _columns(X, member, p, steps)
         if columns.max() < best[0]:
             best = columns.max(), X
         weight = weight / np.maximum(columns / columns.max(), 1e-3) ** 0.7
@@ -236,13 +278,13 @@ def _certified(R: np.ndarray, T: np.ndarray, member: np.ndarray, p: int, rounds:
     # what rounding has left of R - X T is put right, and what is left then is added
     back, X = np.linalg.pinv(rest), best[1]
     X = X + (flat - X @ rest) @ back
-    over = _columns((flat - X @ rest) @ back, member, p).max()
-    return float((_columns(X, member, p).max() + over) * (1.0 + SLACK))
+    over = _columns((flat - X @ rest) @ back, member, p, steps).max()
+    return float((_columns(X, member, p, steps).max() + over) * (1.0 + SLACK))
 
 
-def _columns(X: np.ndarray, member: np.ndarray, p: int) -> np.ndarray:
+def _columns(X: np.ndarray, member: np.ndarray, p: int, steps: int) -> np.ndarray:
     """For each part on the right, the p largest sums over blocks of the norms of X's 2 x 2s."""
     a, b, c, d = X[0::2, 0::2], X[0::2, 1::2], X[1::2, 0::2], X[1::2, 1::2]
     half = np.hypot(a + d, b - c) + np.hypot(a - d, b + c)
-    sums = member.T @ (half / 2.0)
-    return np.sum(-np.sort(-sums, 0)[:p], 0)
+    sums = (member.T @ (half / 2.0)).reshape(steps, -1, half.shape[1])
+    return np.sum(np.sum(-np.sort(-sums, 1)[:, :p], 1), 0)

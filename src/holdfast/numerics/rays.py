@@ -33,6 +33,7 @@ from holdfast.numerics.ratio_bounds import (
     climb,
     effort,
     fixed,
+    gathered,
     largest,
     single,
     top,
@@ -115,42 +116,48 @@ def affordable(found: list[Component], limit: float) -> bool:
     """Whether `worst` is exact, or gives a narrow interval, within ``limit``."""
     each = limit / max(1, len(found))
     return all(
-        _cost(_lines(part, DIRECTIONS[-1])[0]) <= each or FEW * effort(part) <= WORK * each
+        cost(lines(part, DIRECTIONS[-1])[0]) <= each or FEW * effort(part) <= WORK * each
         for part in found
     )
 
 
-def worst(found: list[Component], blocks: int, most: int, limit: float = MOST) -> Ratios:
+def worst(
+    found: list[Component], blocks: int, most: int, limit: float = MOST, steps: int = 1
+) -> Ratios:
     """The ratio of each block alone, and of the worst sets of 1 .. ``most`` of the ``blocks``.
 
-    Exact where all parts are rows and ``limit``, shared by the components, allows all rays to
-    be tried; elsewhere an interval that contains it.
+    With ``steps``, the blocks are so many runs of equal length, and the sets have 1 .. ``most``
+    blocks of each: (a + c) / (b + d) is still the worst of one component, since the largest of
+    two lists together are no more than the largest of each. Exact where all parts are rows and
+    ``limit``, shared by the components, allows all rays to be tried; elsewhere an interval that
+    contains it.
     """
     ratios = Ratios(*(np.zeros(count) for count in (blocks, blocks, most, most)))
     for part in found:
         each = limit / len(found)
-        own = _tried(part, most, each)
+        own = _tried(part, most, each, steps)
         if own is None:
-            own = bounded(part, most, WORK * each)
+            own = bounded(part, most, WORK * each, steps)
         elif not own.narrow:
-            own = own.tightened(bounded(part, most, WORK * each))
+            own = own.tightened(bounded(part, most, WORK * each, steps))
         ratios = ratios.worse(own)
     return ratios
 
 
-def _tried(part: Component, most: int, limit: float) -> Ratios | None:
+def _tried(part: Component, most: int, limit: float, steps: int) -> Ratios | None:
     """All rays, with as many directions of a pair as can be afforded; None if too dear."""
     pairs = int(np.sum(np.any(part.parts[:, 1] != 0.0, axis=1)))
     for K in DIRECTIONS if pairs else (1,):
         if pairs * K > LINES:
             continue
-        rows, weights = _lines(part, K)
-        if _cost(rows) <= limit:
-            return _best(part, rows, weights, most, math.cos(math.pi / (2 * K)) if pairs else 1.0)
+        rows, weights = lines(part, K)
+        if cost(rows) <= limit:
+            factor = math.cos(math.pi / (2 * K)) if pairs else 1.0
+            return _best(part, rows, weights, most, factor, steps)
     return None
 
 
-def _lines(part: Component, K: int) -> tuple[np.ndarray, np.ndarray]:
+def lines(part: Component, K: int) -> tuple[np.ndarray, np.ndarray]:
     """Unit rows (N x r), no two parallel, and their weights (N x blocks): g = |rows u| weights."""
     paired = np.any(part.parts[:, 1] != 0.0, axis=1)
     angle = np.arange(K) * math.pi / K
@@ -170,47 +177,49 @@ def _lines(part: Component, K: int) -> tuple[np.ndarray, np.ndarray]:
     return rows[first], weights
 
 
-def _cost(rows: np.ndarray) -> float:
+def cost(rows: np.ndarray) -> float:
     """N times N choose r - 1."""
     N, r = rows.shape
     rays = math.lgamma(N + 1) - math.lgamma(r) - math.lgamma(N - r + 2)
     return N * math.exp(min(rays, 600.0))
 
 
-def _best(part: Component, rows, weights: np.ndarray, most: int, factor: float) -> Ratios:
+def _best(
+    part: Component, rows: np.ndarray, weights: np.ndarray, most: int, factor: float, steps: int
+) -> Ratios:
     """The best of all rays, where |rows u| weights is from ``factor`` to once the sums."""
     m, r = part.blocks, rows.shape[1]
     share, where = np.full(m + most, -1.0), np.zeros((m + most, r))
-    for U in _rays(rows):
+    for U in normals(rows):
         for few in np.array_split(U, math.ceil(len(U) * len(rows) / CHUNK)):
             g = np.abs(few @ rows.T) @ weights
             g = g / np.sum(g, 1, keepdims=True)
-            shares = np.concatenate([g, np.cumsum(-np.sort(-g, 1), 1)[:, :most]], 1)
+            shares = np.concatenate([g, gathered(g, steps)[:, :most]], 1)
             at = np.argmax(shares, 0)
             new = shares[at, np.arange(m + most)]
             better = new > share
             share[better], where[better] = new[better], few[at[better]]
     if factor == 1.0:
-        lower = _values(part, where, most)
+        lower = _values(part, where, most, steps)
         return Ratios(lower[:m], lower[:m], lower[m:], lower[m:])
     g = np.abs(where @ rows.T) @ weights
-    upper = np.append(np.diagonal(single(g)[:m]), np.diagonal(largest(g, most)[m:])) / factor
-    lower = _values(part, where, most)
+    upper = np.append(np.diagonal(single(g)[:m]), np.diagonal(largest(g, most, steps)[m:])) / factor
+    lower = _values(part, where, most, steps)
     if factor < NEAR:
         own = climb(part, where[:m], fixed(np.eye(m, dtype=bool)), STEPS)
-        sets = climb(part, where[m:], top(np.arange(1, most + 1)), STEPS)
-        lower = np.maximum(lower, _values(part, np.concatenate([own, sets]), most))
+        sets = climb(part, where[m:], top(np.arange(1, most + 1), steps), STEPS)
+        lower = np.maximum(lower, _values(part, np.concatenate([own, sets]), most, steps))
     upper = np.maximum(upper, lower)
     return Ratios(lower[:m], upper[:m], lower[m:], upper[m:])
 
 
-def _values(part: Component, U: np.ndarray, most: int) -> np.ndarray:
+def _values(part: Component, U: np.ndarray, most: int, steps: int) -> np.ndarray:
     """The ratio of each block at its row of U, then of the sets at theirs."""
     g, m = part.sums(U), part.blocks
-    return np.append(np.diagonal(single(g[:m])), np.diagonal(largest(g[m:], most)))
+    return np.append(np.diagonal(single(g[:m])), np.diagonal(largest(g[m:], most, steps)))
 
 
-def _rays(rows: np.ndarray) -> Iterator[np.ndarray]:
+def normals(rows: np.ndarray) -> Iterator[np.ndarray]:
     """Unit vectors (k x r) among which is every ray orthogonal to r - 1 independent rows.
 
     The orthogonal plane of r - 2 rows at a time, and in it the normal of each row that comes

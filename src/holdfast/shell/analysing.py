@@ -7,19 +7,28 @@ import numpy as np
 import rich.console
 import rich.table
 
-from holdfast.analysis.advice import advice, between
+from holdfast.analysis.advice import advice
 from holdfast.analysis.fusion import Fusion, Remedy
 from holdfast.analysis.whole import Analysis, analysis
+from holdfast.analysis.wording import between
 from holdfast.analysis.zeros import Zero
+from holdfast.estimators.l1_decoder import L1Decoder
 from holdfast.loop import Scenario
 from holdfast.shell import runtime
 from holdfast.shell.calibrating import busy
+from holdfast.shell.decoding_content import (
+    decoders_table,
+    decoding_content,
+    finite,
+    named,
+    ratio,
+)
 from holdfast.shell.scenario import read_scenario
 
 FUSING = ("decomposition", "secure_fusion")
 """Estimators that fuse local estimates."""
-KNOWN = 1e-5
-"""Relative distance of two bounds that are given as one number."""
+DECODING = ("l1_decoder", "l1_kalman")
+"""Estimators that decode a window of samples."""
 
 
 def analyse(scenario: str, as_json: bool, allow_python: bool) -> None:
@@ -28,13 +37,14 @@ def analyse(scenario: str, as_json: bool, allow_python: bool) -> None:
     found = read_scenario(scenario, allow_python=allow_python).scenario
     x0, P0 = _start(found)
     with busy("analysing the plant"):
-        result = analysis(found.plant, x0, P0)
-    sensors_lie = _sensors_lie(found)
-    sentences = advice(result, getattr(found.monitor.estimator, "delay", None), sensors_lie)
+        result = analysis(found.plant, x0, P0, **_decoder(found))
+    fused, decoded = _about(found)
+    delay = getattr(found.monitor.estimator, "delay", None)
+    sentences = advice(result, delay, fused, decoded)
     if as_json:
         print(json.dumps(content(result, sentences), allow_nan=False, indent=1))
     else:
-        _print(result, sentences, sensors_lie)
+        _print(result, sentences, fused, decoded)
 
 
 def _start(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
@@ -45,10 +55,33 @@ def _start(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(x0, float), np.asarray(P0, float)
 
 
-def _sensors_lie(scenario: Scenario) -> bool:
-    """Whether fusion is what the scenario is about: by its estimator, or for want of channels."""
-    kind = type(scenario.monitor.estimator).__module__.rpartition(".")[2]
-    return kind in FUSING or not scenario.plant.attacks
+def _kind(scenario: Scenario) -> str:
+    return type(scenario.monitor.estimator).__module__.rpartition(".")[2]
+
+
+def _about(scenario: Scenario) -> tuple[bool, bool]:
+    """Whether the scenario is about fusion, or about decoding: by its estimator.
+
+    Of other estimators, where the plant has no attack channels, it may be about either.
+    """
+    kind, open_to_both = _kind(scenario), not scenario.plant.attacks
+    return (
+        kind in FUSING or (open_to_both and kind not in DECODING),
+        kind in DECODING or (open_to_both and kind not in FUSING),
+    )
+
+
+def _decoder(scenario: Scenario) -> dict[str, Any]:
+    """Of a decoder: its window, whom it always trusts, whether it weighs samples by their noise."""
+    estimator = scenario.monitor.estimator
+    decoder = getattr(estimator, "decoder", estimator)
+    if not isinstance(decoder, L1Decoder):
+        return {}
+    return {
+        "window": decoder.window.length,
+        "trusted": tuple(np.flatnonzero(decoder.window.honest).tolist()),
+        "weighted": decoder.weights == "noise",
+    }
 
 
 def content(found: Analysis, sentences: list[str]) -> dict[str, Any]:
@@ -57,7 +90,7 @@ def content(found: Analysis, sentences: list[str]) -> dict[str, Any]:
     return {
         "observable": seen.observable,
         "observability_index": seen.rows,
-        "unobserved": [_named(v, found.model.states) for v in seen.hidden.T],
+        "unobserved": [named(v, found.model.states) for v in seen.hidden.T],
         "eigenvalues": [_pair(value) for value in seen.eigenvalues],
         "unstable": seen.unstable,
         "steady_state": {
@@ -68,6 +101,7 @@ def content(found: Analysis, sentences: list[str]) -> dict[str, Any]:
         },
         "attacks": _attacks(found),
         "window": None if window is None else window._asdict(),
+        "correctable": decoding_content(found.decoding, found.model.states),
         "fusion": _fusion(found.fusion),
         "of": found.model.note or None,
         "advice": sentences,
@@ -89,7 +123,7 @@ def _attacks(found: Analysis) -> dict[str, Any]:
         "delay": attacks.delay,
         "identified": all(channel.delay is not None for channel in attacks.channels),
         "rank": attacks.transfer.rank,
-        "invisible": [_named(v, names) for v in attacks.transfer.lost.T],
+        "invisible": [named(v, names) for v in attacks.transfer.lost.T],
         "zeros": [_zero(zero, found) for zero in attacks.transfer.zeros],
         "shields": list(attacks.shields),
         "bounded": [bounds._asdict() for bounds in found.bounds],
@@ -100,12 +134,12 @@ def _fusion(found: Fusion) -> dict[str, Any]:
     by_name = [dict(zip(found.sensors, v.tolist(), strict=True)) for v in found[2:4]]
     by_count = [{str(p): x for p, x in enumerate(v.tolist(), 1)} for v in found[4:6]]
     return {
-        "ratio": {name: _ratio(by_name[0][name], by_name[1][name]) for name in found.sensors},
-        "lower": _finite(by_name[0]),
-        "upper": _finite(by_name[1]),
+        "ratio": {name: ratio(by_name[0][name], by_name[1][name]) for name in found.sensors},
+        "lower": finite(by_name[0]),
+        "upper": finite(by_name[1]),
         "bounded": dict(zip(found.sensors, found.bounded, strict=True)),
-        "all_p": {p: _ratio(by_count[0][p], by_count[1][p]) for p in by_count[0]},
-        "all_p_bounds": {"lower": _finite(by_count[0]), "upper": _finite(by_count[1])},
+        "all_p": {p: ratio(by_count[0][p], by_count[1][p]) for p in by_count[0]},
+        "all_p_bounds": {"lower": finite(by_count[0]), "upper": finite(by_count[1])},
         "withstood": found.withstood,
         "sparse_observable": found.sparse_observable,
         "authenticate": [_remedy(remedy) for remedy in found.authenticate],
@@ -118,17 +152,9 @@ def _fusion(found: Fusion) -> dict[str, Any]:
 
 
 def _remedy(remedy: Remedy) -> dict[str, Any]:
-    bounds = _finite({"lower": remedy.lower, "upper": remedy.upper})
-    ratio = _ratio(remedy.lower, remedy.upper)
-    return {"name": remedy.name, "ratio": ratio, **bounds, "enough": remedy.enough}
-
-
-def _ratio(lower: float, upper: float) -> float | None:
-    return lower if upper < np.inf and upper - lower <= KNOWN * upper else None
-
-
-def _finite(values: dict[str, float]) -> dict[str, float | None]:
-    return {name: value if np.isfinite(value) else None for name, value in values.items()}
+    bounds = finite({"lower": remedy.lower, "upper": remedy.upper})
+    known = ratio(remedy.lower, remedy.upper)
+    return {"name": remedy.name, "ratio": known, **bounds, "enough": remedy.enough}
 
 
 def _zero(zero: Zero, found: Analysis) -> dict[str, Any]:
@@ -142,10 +168,6 @@ def _zero(zero: Zero, found: Analysis) -> dict[str, Any]:
     }
 
 
-def _named(vector: np.ndarray, names: tuple[str, ...]) -> dict[str, float]:
-    return {name: float(value) for name, value in zip(names, vector, strict=True)}
-
-
 def _complex(vector: np.ndarray, names: tuple[str, ...]) -> dict[str, list[float]]:
     return {name: _pair(value) for name, value in zip(names, vector, strict=True)}
 
@@ -155,7 +177,7 @@ def _pair(value: complex) -> list[float]:
     return [value.real + 0.0, value.imag + 0.0]
 
 
-def _print(found: Analysis, sentences: list[str], sensors_lie: bool) -> None:
+def _print(found: Analysis, sentences: list[str], fused: bool, decoded: bool) -> None:
     console = rich.console.Console()
     table = rich.table.Table(show_header=False, box=None, pad_edge=False)
     for name, text in _rows(found):
@@ -163,8 +185,10 @@ def _print(found: Analysis, sentences: list[str], sensors_lie: bool) -> None:
     console.print(table)
     if found.attacks.channels:
         console.print(_channels(found))
-    if sensors_lie and found.fusion.sensors:
+    if fused and found.fusion.sensors:
         console.print(_liars(found.fusion))
+    if decoded and found.decoding.correctable.reason is None:
+        console.print(decoders_table(found.decoding.correctable))
     for sentence in sentences:
         console.print(f"- {sentence}", markup=False, highlight=False, soft_wrap=True)
 
