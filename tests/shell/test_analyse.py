@@ -183,3 +183,34 @@ def test_errors_are_those_of_the_other_commands(folder, command):
     assert (code, out) == (2, "")
     assert "absent.toml" in err
     assert err.count("\n") == 1
+
+
+HOPPING = """\
+[plant]
+kind = "linear"
+A = [[1.0]]
+C = [[100.0], [1.0], [1.0]]
+Q = [[1e-6]]
+R = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+
+[estimator]
+kind = "l1_decoder"
+window = 4
+
+[detector]
+kind = "chi_square"
+"""
+
+
+def test_what_decoders_correct_is_two_numbers(tmp_path, command):
+    """The errata's counterexample: the paper's condition holds for l0, and l1 corrects nothing."""
+    path = tmp_path / "hopping.toml"
+    path.write_text(HOPPING)
+    found = analysed(command, path)
+    said = found["correctable"]
+    assert (said["window"], said["l0"], said["l1"]) == (4, 1, 0)
+    # (100 of 102) over (2 of 102), at every step
+    assert said["l1_ratio"]["1"] == pytest.approx(50.0, rel=1e-12)
+    assert said["relaxed"] == 5
+    assert any("l0 corrects 1 attack per step" in text for text in found["advice"])
+    assert all(math.isfinite(number) for number in numbers(found))
