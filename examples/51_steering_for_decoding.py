@@ -19,7 +19,14 @@ plant = quadrotor.build(sensors=5)
 weights = {"state_weight": np.eye(10).tolist(), "input_weight": np.eye(3).tolist()}
 
 table = Table(title="LQR, and its poles made real and spread out", box=box.SIMPLE)
-for heading in ("spread by", "cost", "sensors that see a mode", "weakest view", "l0, long window", "l1, T = 10"):
+for heading in (
+    "spread by",
+    "cost",
+    "sensors that see a mode",
+    "weakest view",
+    "l0, long window",
+    "l1, T = 10",
+):
     table.add_column(heading, justify="right")
 for one in candidates(plant, sizes=(0.01, 0.1, 0.3), **weights):
     # of the l0 count the analysis of poles says what a long window corrects
