@@ -2,10 +2,11 @@
 
 from collections.abc import Callable
 
-from holdfast.papers import care, decompose
+from holdfast.papers import care, decoder, decompose
 from holdfast.papers.rows import Study
 
 STUDIES: dict[str, Callable[[], Study]] = {
     "care": care.study,
     "decompose": decompose.study,
+    "decoder": decoder.study,
 }

@@ -1,6 +1,8 @@
 """The papers' figures drawn again: panels one above the other over the same time."""
 
 import io
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import matplotlib
@@ -13,16 +15,23 @@ from holdfast.report.figures import STYLE
 
 DASHED = ("truth", "threshold")
 COLOURS = (ALARM, MAIN, FAULT, "#009e73", ATTACK, LOST)
+MARKS = ((0, (4, 3)), (0, (1, 2)))
+"""Dashes of the first and of the second vertical line."""
 WIDTH, HEIGHT, TALL = 8.4, 2.1, 3.2
 DOTS_PER_INCH = 150
 
 
 class Panel(NamedTuple):
-    """Series over time by name; those called "truth" or "threshold" are dashed."""
+    """Series over time by name; those called "truth" or "threshold" are dashed.
+
+    ``x``: of this panel's series, where they have their own; ``marks``: vertical lines by name.
+    """
 
     title: str
     lines: dict[str, np.ndarray]
     log: bool = False
+    x: np.ndarray | None = None
+    marks: Mapping[str, float] = MappingProxyType({})
 
 
 def stacked(t: np.ndarray, panels: list[Panel]) -> Figure:
@@ -39,6 +48,16 @@ def over(x: np.ndarray, panels: list[Panel], label: str, *, same: bool = False) 
     for place in figure.axes:
         place.set_xscale("log")
         place.set_xlim(x[0], x[-1])
+        place.grid(True, which="major", color=GRID, lw=0.5)
+    return figure
+
+
+def against(x: np.ndarray, panels: list[Panel], label: str) -> Figure:
+    """The panels over a quantity that starts at 0; those without a logarithmic axis from 0 up."""
+    figure = _drawn(x, panels, label, TALL)
+    for place, panel in zip(figure.axes, panels, strict=True):
+        if not panel.log:
+            place.set_ylim(0, None)
         place.grid(True, which="major", color=GRID, lw=0.5)
     return figure
 
@@ -61,8 +80,11 @@ def _drawn(
             place.set_xlim(0, x[-1])
             if panel.log:
                 place.set_yscale("log")
+            own = x if panel.x is None else panel.x
             for name, values in panel.lines.items():
-                place.plot(x, values, label=name, **style[name])
+                place.plot(own, values, label=name, **style[name])
+            for (name, at), dashes in zip(panel.marks.items(), MARKS, strict=False):
+                place.axvline(at, label=name, color=INK, lw=0.9, ls=dashes)
         axes[-1].set_xlabel(label)
         found = {
             label: line
