@@ -56,6 +56,8 @@ ESTIMATOR_SETTINGS = {
     "unscented": {},
     "decomposition": {},
     "secure_fusion": {"gamma": 2.0},
+    "l1_decoder": {"window": 3},
+    "l1_kalman": {"window": 3, "threshold": 5.0},
 }
 # Filters with a fixed gain: where a sensor never arrives its gain is not used, but those of the
 # others stay, and so the filter is not that of a plant without the sensor.
@@ -129,6 +131,26 @@ def test_estimators(kind, plant):
 def test_secure_fusion_with_other_settings(settings):
     built = ESTIMATORS["secure_fusion"](PLANTS["both"], X0, P0, gamma=2.0, **settings)
     check_estimator(built, steps=20)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "settings"),
+    [
+        ("l1_decoder", {"norm": "l1l2", "weights": "noise"}),
+        ("l1_decoder", {"norm": "l1linf"}),
+        ("l1_decoder", {"norm": "l0", "threshold": 5.0}),
+        ("l1_decoder", {"trusted": ["wheel"]}),
+        ("l1_kalman", {"suspects": "gate"}),
+        ("l1_kalman", {"suspects": "inflate", "threshold": 2.0}),
+    ],
+)
+def test_decoders_with_other_settings(kind, settings):
+    def build(plant):
+        trusted = [name for name in settings.get("trusted", ()) if name in plant.outputs]
+        return ESTIMATORS[kind](plant, X0, P0, window=3, **(settings | {"trusted": trusted}))
+
+    check_estimator(build, PLANTS["both"], steps=20)
 
 
 @pytest.mark.parametrize("on", ["attack", "residual"])

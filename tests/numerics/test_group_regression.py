@@ -16,6 +16,7 @@ import scipy.sparse as sp
 from scipy.optimize import linprog
 
 from holdfast.numerics import group_regression as module
+from holdfast.numerics import norm_cones
 from holdfast.numerics.group_regression import group_regression
 
 NORMS = ("l1l2", "l1linf")
@@ -415,7 +416,7 @@ def test_data_that_are_not_finite_show(norm):
 
 def test_too_few_rounds_show_in_the_gap(monkeypatch):
     """Nor does the bound lie then."""
-    monkeypatch.setattr(module, "ROUNDS", 2)
+    monkeypatch.setattr(norm_cones, "ROUNDS", 2)
     monkeypatch.setattr(module, "NEWTON", 0)
     cut = jax.jit(lambda Phi, y: group_regression(Phi, y, GROUP))
     for seed in range(5):

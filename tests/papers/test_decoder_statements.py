@@ -19,14 +19,16 @@ from holdfast.plants.library import random_systems
 from holdfast.report.tables import json_safe
 
 LIST = Path(__file__).parent / "decoder_statements.toml"
-LISTED: list[dict[str, str]] = tomllib.loads(LIST.read_text())["statement"]
+EVERY: list[dict[str, str]] = tomllib.loads(LIST.read_text())["statement"]
+# the others fly and filter: `test_decoder_uav` has them, and the whole run below
+LISTED = [statement for statement in EVERY if "runs" not in statement]
 OPPOSITE = {
     "holds": "fails",
     "fails": "holds",
     "reproduced": "not reproduced",
     "not reproduced": "reproduced",
 }
-SMALL = decoder.Amount(cases=60, solved=8, batches=2, trials=100, coded=3, plants=40, seeds=2)
+SMALL = decoder.Amount(cases=60, solved=8, batches=2, trials=100, coded=3, plants=40, seeds=0)
 
 
 @pytest.fixture(scope="module")
@@ -57,9 +59,11 @@ def test_the_list_holds_everything_that_the_paper_numbers(shared_data):
     kinds = "Definition|Proposition|Lemma|Theorem"
     numbered = {" ".join(pair) for pair in re.findall(rf"\b({kinds}) (\d)\b", text)}
     assert len(numbered) == 2 + 5 + 6 + 1
-    listed = {statement["id"].split(", ")[0] for statement in LISTED}
+    listed = {statement["id"].split(", ")[0] for statement in EVERY}
     assert numbered <= listed
-    assert {"Fig. 1", "Fig. 2"} <= listed
+    # Fig. 4 is a sketch of channels
+    assert {f"Fig. {i}" for i in range(1, 12)} - {"Fig. 4"} <= listed
+    assert "Algorithm 1" in listed
     assert listed <= set(decoder.ORDER)
 
 
@@ -237,9 +241,9 @@ PAGE = (Path(__file__).parents[2] / "docs" / "papers.md").read_text().split("## 
 @pytest.mark.slow
 def test_the_page_on_the_papers_tells_the_numbers_of_the_whole_run():
     rows = {row.id: row for row in decoder.study().rows}
-    assert {id: row.verdict for id, row in rows.items()} == {
-        statement["id"]: statement["verdict"] for statement in LISTED
-    }
+    assert [(id, row.verdict) for id, row in rows.items()] == [
+        (statement["id"], statement["verdict"]) for statement in EVERY
+    ]
     shown = [
         *rows["Fig. 1, three systems, p = 10"].ours,
         *rows["Fig. 2, three systems, p = 8"].ours,

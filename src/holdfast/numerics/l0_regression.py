@@ -30,22 +30,13 @@ from holdfast.numerics.circuits import (
     CONSISTENT,
     UNDECIDED,
     Disjoint,
-    Strips,
     disjoint,
     shortest_fit,
-    spanning,
 )
-from holdfast.numerics.linalg import repeat
+from holdfast.numerics.l0_strips import FIXED, Problem, prepared
 
-EXACT = 1e-12
-"""Least tolerance: of the sample's size or, if it is larger, of what the median sample says of a
-row of this length."""
-ABSOLUTE, REWEIGHTED = 12, 6
-"""Rounds of the first guess: towards least absolute errors, then towards few."""
-GOOD, FIXED = 10.0, 1e3
-"""How much rather rows that fit the best x so far, or are known to be clean, are looked at."""
-WIDE = 30.0
-"""Times the median width at which a strip is looked at last."""
+GOOD = 10.0
+"""How much rather rows that fit the best x so far are looked at."""
 ALIKE = 1e-11
 """Of the terms of Phi_j x: what rounding makes of two states that are one."""
 
@@ -75,22 +66,6 @@ class L0Fit(eqx.Module):
     nodes: Int[Array, ""]
     feasible: Bool[Array, ""]
     complete: Bool[Array, ""]
-
-
-class _Problem(NamedTuple):
-    """The rows as given, and divided by ``scale`` as strips in another basis, about a good x.
-
-    ``weight``: which rows to look at first.
-    """
-
-    Phi: Float[Array, "m n"]
-    y: Float[Array, " m"]
-    half: Float[Array, " m"]
-    scale: Float[Array, " m"]
-    strips: Strips
-    used: Bool[Array, " m"]
-    trusted: Bool[Array, " m"]
-    weight: Float[Array, " m"]
 
 
 class _Best(NamedTuple):
@@ -137,7 +112,7 @@ def l0_regression(
 ) -> L0Fit:
     """The x that contradicts the fewest units, all of them up to ``states``, and the proof.
 
-    Row j fits x where |y_j - Phi_j x| <= t_j, its ``tolerance``, but not under `EXACT` of what
+    Row j fits x where |y_j - Phi_j x| <= t_j, its ``tolerance``, but not under 1e-12 of what
     samples are. What is minimised is the number of units to throw out for the strips of all other
     rows to have a point in common. ``x`` is the least-squares fit of these rows, weighted by
     1 / t_j: with noise it may itself leave a strip that another x does not. All strips are
@@ -191,7 +166,8 @@ def _in_turn(setting: _Setting, axis_size, in_batched, *given):
 
 
 def _alone(setting: _Setting, Phi, y, tolerance, used, trusted, start):
-    problem = _prepared(setting, Phi, y, tolerance, used, trusted)
+    unit = jnp.asarray(setting.unit)
+    problem = prepared(Phi, y, unit, setting.units, tolerance, used, trusted)
     last = jax.lax.while_loop(
         lambda s: (s.top > 0) & (s.nodes < setting.nodes),
         lambda s: _visit(setting, problem, s),
@@ -219,65 +195,7 @@ def _limit(setting: _Setting, best: _Best):
     return best.least + jnp.where(best.found >= setting.states, 0, 1)
 
 
-def _prepared(setting: _Setting, Phi, y, tolerance, used, trusted) -> _Problem:
-    """In terms of the rows' own best basis, about a robust fit: what is clean is then small."""
-    sound = used & jnp.isfinite(y)
-    seen = jnp.where(sound[:, None], Phi, 0.0)
-    # nothing fits 0 x = 1
-    y = jnp.where(sound, y, jnp.where(used, 1.0, 0.0))
-    tolerance, trusted = jnp.where(sound, tolerance, 0.0), trusted & used
-    column = jnp.max(jnp.abs(seen), 0)
-    rows, size = _unit(seen / jnp.where(column > 0, column, 1.0))
-    rows, again = _unit(spanning(rows, jnp.where(used, 1.0, 0.0)).table)
-    scale = size * again
-    typical = _median(jnp.abs(y / scale)) * jnp.sqrt(jnp.sum(rows * rows, 1)) * scale
-    half = jnp.maximum(tolerance, EXACT * jnp.maximum(jnp.abs(y), typical))
-    strips = Strips(rows, y / scale, half / scale, jnp.asarray(setting.unit))
-    middle = rows @ _robust(setting, strips, used, trusted)
-    strips = strips._replace(centre=jnp.where(used, strips.centre - middle, 0.0))
-    width = _median(strips.half)
-    weight = jnp.where(strips.half > WIDE * width, 1.0 / WIDE, 1.0)
-    return _Problem(seen, y, half, scale, strips, used, trusted, weight)
-
-
-def _unit(rows):
-    size = jnp.sqrt(jnp.sum(rows * rows, 1))
-    size = jnp.where(size > 0, size, 1.0)
-    return rows / size[:, None], size
-
-
-def _median(a):
-    """Of what is not zero."""
-    some = jnp.sum(jnp.where(a > 0, 1, 0))
-    return jnp.where(some > 0, jnp.sort(a)[len(a) - 1 - some // 2], 0.0)
-
-
-def _robust(setting: _Setting, strips: Strips, used, trusted):
-    """Reweighted least squares: a guess, on which no proof rests."""
-    rows, y = strips.rows, strips.centre
-    n = rows.shape[1]
-    typical = _median(jnp.abs(y)) + jnp.finfo(y.dtype).tiny ** 0.25
-    floor = jnp.maximum(strips.half, 1e-9 * typical)
-
-    def closer(i, s):
-        missed = jnp.where(used, jnp.square(y - rows @ s), 0.0)
-        if setting.units < len(y):
-            missed = jnp.zeros(setting.units).at[strips.unit].add(missed)[strips.unit]
-        # a single sample out of all proportion must not have a say in the first round
-        inverse = 1.0 / (missed + jnp.square(jnp.where(i == 0, typical, floor)))
-        weight = jnp.where(i < ABSOLUTE, jnp.sqrt(inverse), inverse)
-        weight = jnp.where(used, weight * jnp.where(trusted, FIXED, 1.0), 0.0)
-        heavy = (weight / jnp.max(weight))[:, None] * rows
-        normal = heavy.T @ rows
-        ridge = 1e-13 * (1e-3 + jnp.trace(normal))
-        return s + jnp.linalg.solve(normal + ridge * jnp.eye(n), heavy.T @ (y - rows @ s))
-
-    s = repeat(ABSOLUTE + REWEIGHTED, closer, jnp.zeros(n))
-    # samples about it must still be the samples
-    return jnp.where(jnp.all(jnp.abs(rows @ s) < 1e14 * strips.half), s, 0.0)
-
-
-def _blame(setting: _Setting, problem: _Problem, at):
+def _blame(setting: _Setting, problem: Problem, at):
     """How far each unit is from ``at``, at worst, in half widths of its strips."""
     strips = problem.strips
     off = jnp.abs(strips.centre - at) / jnp.maximum(strips.half, jnp.finfo(at.dtype).tiny)
@@ -285,7 +203,7 @@ def _blame(setting: _Setting, problem: _Problem, at):
     return jnp.zeros(setting.units).at[strips.unit].max(off)
 
 
-def _started(setting: _Setting, problem: _Problem, start) -> _Search:
+def _started(setting: _Setting, problem: Problem, start) -> _Search:
     """On the stack nothing is decided, and above it the units that the better guess throws out.
 
     Where both contradict trusted rows these are all: if that does not help, nothing does.
@@ -326,7 +244,7 @@ def _started(setting: _Setting, problem: _Problem, start) -> _Search:
     )
 
 
-def _visit(setting: _Setting, problem: _Problem, search: _Search) -> _Search:
+def _visit(setting: _Setting, problem: Problem, search: _Search) -> _Search:
     """The node on top of the stack."""
     search = search._replace(top=search.top - 1)
     bound = search.bound[search.top]
@@ -337,7 +255,7 @@ def _visit(setting: _Setting, problem: _Problem, search: _Search) -> _Search:
     )
 
 
-def _examined(setting: _Setting, problem: _Problem, search: _Search) -> _Search:
+def _examined(setting: _Setting, problem: Problem, search: _Search) -> _Search:
     decided, best, strips = search.stack[search.top], search.best, problem.strips
     out = decided == _THROWN
     thrown = out[strips.unit] & problem.used & ~problem.trusted
@@ -383,7 +301,7 @@ def _branched(search: _Search, decided, bound, found: Disjoint) -> _Search:
     return search._replace(stack=stack, bound=bounds, top=last + 1)
 
 
-def _leaf(setting: _Setting, problem: _Problem, best: _Best, thrown, count) -> _Best:
+def _leaf(setting: _Setting, problem: Problem, best: _Best, thrown, count) -> _Best:
     """A set without which the rest has a solution: a better one, or one more."""
     scaled = problem.Phi / problem.scale[:, None], problem.y / problem.scale
     x, rank = shortest_fit(problem.strips, *scaled, problem.used & ~thrown)

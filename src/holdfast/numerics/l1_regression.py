@@ -8,15 +8,17 @@ is found by elimination and, should rounding have misled it, improved by pivots.
 solved for exactly, so that rows without error are met to the last digit.
 
 Source: Portnoy and Koenker, *The Gaussian hare and the Laplacian tortoise*, Statistical Science
-12 (1997); Barrodale and Roberts for the pivots; DECODER (12), and (10) by Lemma 2.
+12 (1997); DECODER (12), and (10) by Lemma 2.
 """
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from holdfast.numerics.l1_vertex import Vertex, corner, vertex
 from holdfast.numerics.linalg import SMALL
 from holdfast.numerics.reduced import Reduced, reduced
 
@@ -26,14 +28,12 @@ CLOSE = 1e-9
 """Relative gap at which the interior point has told which vertex it is."""
 STEP = 0.99995
 """Share of the way to the boundary that a step goes."""
-PIVOTS = 64
-"""Changes of the vertex at most; none is usual."""
-ZERO = 1e-11
-"""Residual, relative to the target, that a vertex counts as met; rounding leaves about 1e-15."""
-FEASIBLE = 1e-9
-"""Excess of a multiplier over its bound that is rounding."""
-DEPENDENT = 1e-8
-"""Length left of a unit row after elimination that counts as none."""
+PASSES, CUT = 4, 1e-3
+"""Passes at most, and what each cuts residuals to, relative to the one before."""
+ALIKE = 1e-13
+"""Gap, relative to the target, that is rounding."""
+APART, GOLDEN = 1e-8, 0.6180339887498949
+"""What rows are moved apart by, relative to their terms, in multiples of the golden section."""
 
 
 class Regression(NamedTuple):
@@ -78,21 +78,85 @@ def l1_of_reduced(
     """The same, ``problem`` being these data reduced already."""
     scale = jnp.max(jnp.abs(problem.target), initial=0.0)
     scale = jnp.where(scale > 0, scale, 1.0)
-    goal = problem.target / scale
     present = jnp.arange(Phi.shape[1]) < problem.free
-    d, trust, rounds = _interior(problem.columns, goal, present)
-    corner = _corner(problem.columns, trust, present)
-    v = _vertex(problem.columns, goal, present, d, corner)
+    v = _solved_for(problem.columns, problem.target / scale, present)
     x = problem.state(v.z * scale)
     residual = y - Phi @ x
     size = jnp.abs(residual) if weight is None else jnp.abs(residual) * weight
     size = size if exact is None else jnp.where(exact, 0.0, size)
     objective = jnp.sum(size)
-    gap = jnp.maximum(objective - scale * _bound(problem.columns, goal, present, v), 0.0)
-    return Regression(x, residual, objective, gap, problem.rank, rounds, v.pivots)
+    gap = jnp.maximum(objective - scale * v.bound, 0.0)
+    return Regression(x, residual, objective, gap, problem.rank, v.rounds, v.pivots)
 
 
-def _bound(columns, goal, present, v: "_Vertex"):
+class _Found(NamedTuple):
+    """The best vertex so far, its objective, what the minimum is at least, and what it took."""
+
+    z: Float[Array, " n"]
+    objective: Float[Array, ""]
+    bound: Float[Array, ""]
+    rounds: Int[Array, ""]
+    pivots: Int[Array, ""]
+    passes: Int[Array, ""]
+
+
+def _solved_for(columns, goal, present) -> _Found:
+    """Passes of interior point and vertex: usually one.
+
+    Next to residuals that are larger by many orders the others are all alike to an interior
+    point: another pass takes what is left, large residuals cut short. Where more rows meet in a
+    vertex than it needs pivots may lead nowhere: another pass moves them apart a little, which
+    leaves a vertex that is optimal also without. All are judged by the goal itself.
+    """
+    size = jnp.sum(jnp.abs(goal))
+
+    def going(at: _Found):
+        rough = at.objective - at.bound > CLOSE * at.objective + ALIKE * size
+        return (at.passes == 0) | (rough & (at.passes < PASSES))
+
+    def another(at: _Found) -> _Found:
+        left = goal - columns @ at.z
+        most = jnp.max(jnp.abs(left), initial=0.0) * CUT**at.passes
+        most = jnp.where(most > 0, most, 1.0)
+        d, trust, rounds = _interior(columns, jnp.clip(left / most, -1.0, 1.0), present)
+        basis = corner(columns, trust, present)
+        terms = jnp.abs(goal) + jnp.abs(columns) @ jnp.abs(at.z)
+        shake = jnp.where(at.passes > 0, terms, 0.0) * _uneven(len(goal))
+        v = vertex(columns, goal, present, d, basis, shake)
+        objective = jnp.sum(jnp.abs(v.residual))
+        better = objective <= at.objective
+        return _Found(
+            jnp.where(better, v.z, at.z),
+            jnp.where(better, objective, at.objective),
+            jnp.maximum(at.bound, _bound(columns, goal, present, v)),
+            at.rounds + rounds,
+            at.pivots + v.pivots,
+            at.passes + 1,
+        )
+
+    zero = jnp.asarray(0)
+    start = _Found(jnp.zeros(len(present)), size, jnp.zeros(()), zero, zero, zero)
+    return jax.lax.while_loop(going, another, start)
+
+
+def sparsest(annihilator: Float[Array, "r m"], observed: Float[Array, " r"]) -> Regression:
+    """The E with the least sum of absolute values and N E = observed, as the ``residual``.
+
+    N: the ``annihilator``. Any E_0 that fits, and an orthonormal basis Phi of what N takes to
+    zero, make it a regression: E = E_0 - Phi v, with v as its ``x``. Where nothing fits, E fits
+    in least squares. Source: DECODER (10), (11), Lemma 2.
+    """
+    found = reduced(annihilator, observed)
+    start = found.state(found.columns.T @ found.target)
+    return l1_regression(found.hidden, start)
+
+
+def _uneven(rows: int) -> Float[Array, " m"]:
+    """Small numbers without a pattern."""
+    return jnp.asarray(APART * (np.modf(np.arange(1, rows + 1) * GOLDEN)[0] - 0.5))
+
+
+def _bound(columns, goal, present, v: Vertex):
     """What the minimum is at least: goal'd of a d with columns'd = 0 and no entry above one."""
     d = v.side.at[v.corner.basis].add(jnp.where(present, v.multipliers, 0.0))
     # rounding in the equation, times the coordinates, is what the bound is off by
@@ -122,9 +186,7 @@ def _interior(columns, goal, present: Bool[Array, " n"]):
     residual = columns @ z - goal
     floor = 1e-3 * jnp.mean(jnp.abs(residual)) + 1e-12
     up, down = jnp.maximum(residual, 0.0) + floor, jnp.maximum(-residual, 0.0) + floor
-    start = _Iterate(
-        jnp.full(m, 0.5), z, up, down, jnp.sum(up + down) * 0.5, jnp.asarray(0, jnp.int32)
-    )
+    start = _Iterate(jnp.full(m, 0.5), z, up, down, jnp.sum(up + down) * 0.5, jnp.asarray(0))
 
     def going(at: _Iterate):
         # the objective is about the sum of the absolute residuals
@@ -166,9 +228,7 @@ def _stepped(columns, absent, at: _Iterate) -> _Iterate:
     forward = _reach(a, da, other, -da)
     dual = _reach(at.up, d_up, at.down, d_down)
     a, up, down = a + forward * da, at.up + dual * d_up, at.down + dual * d_down
-    return _Iterate(
-        a, at.z - dual * dz, up, down, up @ a + down @ (1.0 - a), at.round + 1
-    )
+    return _Iterate(a, at.z - dual * dz, up, down, up @ a + down @ (1.0 - a), at.round + 1)
 
 
 def _reach(first, d_first, second, d_second):
@@ -207,109 +267,3 @@ def _solved(factor, right: Float[Array, " n"]) -> Float[Array, " n"]:
         rest = half[i] - sum(factor[k][i] * half[k] for k in range(i + 1, n))
         half[i] = rest * factor[i][i]
     return jnp.stack(half)
-
-
-class _Corner(NamedTuple):
-    """Independent rows ``basis`` (n,), and the inverse of the matrix they make."""
-
-    basis: Int[Array, " n"]
-    inverse: Float[Array, "n n"]
-
-
-def _corner(columns, trust, present) -> _Corner:
-    """Independent rows, those whose residual is nearest to zero first (elimination with pivots)."""
-    m, n = columns.shape
-    length = jnp.sqrt(jnp.sum(columns * columns, 1))
-    unit = columns / jnp.where(length > 0, length, 1.0)[:, None]
-    root = jnp.sqrt(trust) * length
-    index = jnp.arange(n)
-
-    def chosen(i, carry):
-        left, basis, directions, made = carry
-        size = jnp.sqrt(jnp.sum(left * left, 1))
-        row = jnp.argmax(jnp.where(size > DEPENDENT, root * size, 0.0))
-        short = size[row]
-        here = (present & (index == i)).astype(float)
-        direction = left[row] / jnp.where(short > DEPENDENT, short, 1.0)
-        share = directions @ columns[row]
-        # direction = made_i basis rows
-        own = (here - share @ made) / jnp.where(short > DEPENDENT, short * length[row], 1.0)
-        left = left - (left @ direction)[:, None] * direction
-        return (
-            left.at[row].set(0.0),
-            jnp.where(index == i, row.astype(jnp.int32), basis),
-            directions + here[:, None] * direction,
-            made + here[:, None] * own,
-        )
-
-    start = unit, jnp.zeros(n, jnp.int32), jnp.zeros((n, n)), jnp.zeros((n, n))
-    _, basis, directions, made = jax.lax.fori_loop(0, n, chosen, start)
-    return _Corner(basis, directions.T @ made)
-
-
-class _Vertex(NamedTuple):
-    """A corner, its residual (m,), the signs ``side`` (m,) of the rows that are not in it and the
-    multipliers (n,) of those that are, which say whether it is optimal.
-    """
-
-    corner: _Corner
-    z: Float[Array, " n"]
-    residual: Float[Array, " m"]
-    side: Float[Array, " m"]
-    multipliers: Float[Array, " n"]
-    pivots: Int[Array, ""]
-
-
-def _vertex(columns, goal, present, d, corner: _Corner) -> _Vertex:
-    """The vertex, improved by pivots until it is optimal."""
-
-    def at(corner, count):
-        mine = jnp.where(present, goal[corner.basis], 0.0)
-        z = corner.inverse @ mine
-        # one refinement: what elimination lost in digits comes back
-        z = z + corner.inverse @ (mine - columns[corner.basis] @ z)
-        residual = goal - columns @ z
-        basic = _among(corner.basis, present, len(goal))
-        # a row that is met without being in the basis keeps the interior point's multiplier
-        met = jnp.abs(residual) <= ZERO
-        side = jnp.where(basic, 0.0, jnp.where(met, d, jnp.sign(residual)))
-        multipliers = -(side @ columns) @ corner.inverse
-        return _Vertex(corner, z, residual, side, multipliers, count)
-
-    def going(v: _Vertex):
-        return (jnp.max(jnp.abs(v.multipliers)) > 1.0 + FEASIBLE) & (v.pivots < PIVOTS)
-
-    def pivoted(v: _Vertex):
-        basis, inverse = v.corner
-        out = jnp.argmax(jnp.abs(v.multipliers))
-        along = -inverse[:, out] * jnp.sign(v.multipliers[out])
-        free = ~_among(basis, present, len(goal))
-        row = _entering(columns @ along, free, v, jnp.abs(v.multipliers[out]))
-        change = columns[row] @ inverse - jnp.where(jnp.arange(len(basis)) == out, 1.0, 0.0)
-        inverse = inverse - inverse[:, out, None] * change / (columns[row] @ inverse[:, out])
-        return at(_Corner(basis.at[out].set(row), inverse), v.pivots + 1)
-
-    return jax.lax.while_loop(going, pivoted, at(corner, jnp.asarray(0, jnp.int32)))
-
-
-def _among(basis, present, rows: int) -> Bool[Array, " m"]:
-    """Which rows are in the basis."""
-    same = (jnp.arange(rows)[:, None] == basis) & present
-    return jnp.any(same, 1)
-
-
-def _entering(change, free, v: _Vertex, slope) -> Int[Array, ""]:
-    """The row that becomes zero at the lowest point along an edge of a vertex.
-
-    The residuals of the ``free`` rows move by minus ``change``; the sum falls by ``slope`` - 1
-    per unit at first.
-    """
-    met = jnp.abs(v.residual) <= ZERO
-    moving = free & (jnp.abs(change) > ZERO)
-    ahead = moving & (met | (v.residual * change > 0.0))
-    step = jnp.where(met, 0.0, v.residual / jnp.where(moving, change, 1.0))
-    # a row that is met bends by less: part of its slope is in the multiplier already
-    bend = jnp.where(met, jnp.abs(change) + v.side * change, 2.0 * jnp.abs(change))
-    order = jnp.argsort(jnp.where(ahead, step, jnp.inf))
-    risen = jnp.cumsum(jnp.where(ahead, bend, 0.0)[order])
-    return order[jnp.argmax(risen >= slope - 1.0)].astype(jnp.int32)

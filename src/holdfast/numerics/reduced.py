@@ -22,7 +22,8 @@ RANK = 1e-10
 class Reduced(NamedTuple):
     """target (m,) = columns (m x n) z, x = start + back z, over the rows that are not exact.
 
-    ``lead`` (n x m) is what the exact rows make of y: start = lead y. ``free``: how many coordinates z has, the first ones; ``rank``: of all rows together.
+    ``lead`` (n x m) is what the exact rows make of y: start = lead y. ``free``: how many
+    coordinates z has, the first ones; ``rank``: of all rows together.
     ``hidden`` (n x n): an orthonormal basis (columns, then zeros) of what no row sees.
     """
 
@@ -58,51 +59,58 @@ def reduced(
     size = jnp.sqrt(jnp.sum(rows * rows, 0))
     size = jnp.where(size > 0, size, 1.0)
     rows = rows / size
-    if exact is None:
-        found = _all_alike(rows, goal)
-    else:
-        found = jax.lax.cond(
-            jnp.any(exact), lambda: _after_exact(rows, goal, exact), lambda: _all_alike(rows, goal)
-        )
     n = len(size)
-    hidden = jax.lax.cond(
-        found.rank < n,
-        lambda: orthonormal(found.hidden / size[:, None]).columns,
-        lambda: jnp.zeros((n, n)),
+    free = _Freedom(rows, goal, jnp.zeros(n), jnp.zeros(rows.shape[::-1]), jnp.eye(n), _none())
+    if exact is not None:
+        free = jax.lax.cond(jnp.any(exact), lambda: _after_exact(rows, goal, exact), lambda: free)
+    found = orthonormal(free.rows)
+    rank = free.rank + found.rank
+
+    def unseen():
+        # directions that are not there have a column of zeros and would be called unseen
+        some = free.directions @ found.rest / size[:, None]
+        length = jnp.sqrt(jnp.sum(some * some, 0))
+        return orthonormal(some / jnp.where(length > 0, length, 1.0)).columns
+
+    hidden = jax.lax.cond(rank < n, unseen, lambda: jnp.zeros((n, n)))
+    lead = free.lead / size[:, None]
+    return Reduced(
+        found.columns,
+        free.goal,
+        free.start / size,
+        lead if weight is None else lead * weight,
+        free.directions @ found.by / size[:, None],
+        found.rank,
+        rank,
+        hidden,
     )
-    lead = found.lead / size[:, None]
-    return found._replace(
-        start=found.start / size,
-        lead=lead if weight is None else lead * weight,
-        back=found.back / size[:, None],
-        hidden=hidden,
-    )
 
 
-def _all_alike(rows, goal) -> Reduced:
-    found = orthonormal(rows)
-    start, lead = jnp.zeros(rows.shape[1]), jnp.zeros(rows.shape[::-1])
-    return Reduced(found.columns, goal, start, lead, found.by, *[found.rank] * 2, found.rest)
+class _Freedom(NamedTuple):
+    """goal = rows s, x = start + directions s: what the exact rows leave, ``rank`` being theirs."""
+
+    rows: Float[Array, "m n"]
+    goal: Float[Array, " m"]
+    start: Float[Array, " n"]
+    lead: Float[Array, "n m"]
+    directions: Float[Array, "n n"]
+    rank: Int[Array, ""]
 
 
-def _after_exact(rows, goal, exact) -> Reduced:
+def _none() -> Int[Array, ""]:
+    return jnp.zeros((), int)
+
+
+def _after_exact(rows, goal, exact) -> _Freedom:
     first = orthonormal(jnp.where(exact[:, None], rows, 0.0))
     lead = first.by @ first.columns.T
     start = lead @ jnp.where(exact, goal, 0.0)
     loose = jnp.where(exact[:, None], 0.0, rows)
-    directions = orthonormal(first.rest).columns
-    then = orthonormal(loose @ directions)
-    return Reduced(
-        then.columns,
-        jnp.where(exact, 0.0, goal - loose @ start),
-        start,
-        lead,
-        directions @ then.by,
-        then.rank,
-        first.rank + then.rank,
-        # directions that are not there have a column of zeros and would be called unseen
-        directions @ then.rest,
-    )
+    # as they come from pivots they are as good as orthogonal
+    length = jnp.sqrt(jnp.sum(first.rest * first.rest, 0))
+    directions = first.rest / jnp.where(length > 0, length, 1.0)
+    rest = jnp.where(exact, 0.0, goal - loose @ start)
+    return _Freedom(loose @ directions, rest, start, lead, directions, first.rank)
 
 
 class Orthonormal(NamedTuple):
@@ -146,6 +154,6 @@ def orthonormal(rows: Float[Array, "m n"]) -> Orthonormal:
             rank + jnp.where(there, 1, 0).astype(rank.dtype),
         )
 
-    start = rows, jnp.eye(n), jnp.zeros((m, n)), jnp.zeros((n, n)), jnp.zeros((), jnp.int32)
+    start = rows, jnp.eye(n), jnp.zeros((m, n)), jnp.zeros((n, n)), _none()
     _, rest, columns, by, rank = jax.lax.fori_loop(0, n, taken, start)
     return Orthonormal(columns, by, rest, rank)

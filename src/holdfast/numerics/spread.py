@@ -65,9 +65,7 @@ def influence(problem: Reduced, curvature: Float[Array, " m"]) -> Influence:
     size = jnp.where(size > 0, size, 1.0)
     found = orthonormal(half / size)
     by = found.by / size[:, None]
-    return Influence(
-        problem.back @ (by @ (by.T @ problem.columns.T)), found.rank >= problem.free
-    )
+    return Influence(problem.back @ (by @ (by.T @ problem.columns.T)), found.rank >= problem.free)
 
 
 def of_signs(
@@ -99,9 +97,10 @@ def errors(
     # of the noise with the first state's error
     with_error = noise.cov @ lead.T + (own * scale) @ gain.T
     mixed = lead @ (own * scale) @ gain.T
-    first = symmetric(
-        lead @ noise.cov @ lead.T + gain @ law.cov @ gain.T + mixed + mixed.T
-    ) + pulled[:, None] * pulled
+    first = (
+        symmetric(lead @ noise.cov @ lead.T + gain @ law.cov @ gain.T + mixed + mixed.T)
+        + pulled[:, None] * pulled
+    )
     # of the first state's error with what the process noise leaves outside the window's reach
     outside = noise.cross - Phi @ (lead @ noise.cross)
     to_last = last @ (lead @ noise.cross + gain @ (scale[:, None] * outside))

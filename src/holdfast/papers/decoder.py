@@ -14,7 +14,9 @@ from holdfast.papers import decoder_appendix as appendix
 from holdfast.papers import decoder_coding as coding
 from holdfast.papers import decoder_counting as counting
 from holdfast.papers import decoder_design as design
+from holdfast.papers import decoder_filter as filtered
 from holdfast.papers import decoder_programs as programs
+from holdfast.papers import decoder_uav as uav
 from holdfast.papers.decoder_exact import Case, cases
 from holdfast.papers.rows import Row, Study
 
@@ -39,12 +41,18 @@ class Part(NamedTuple):
     figures: Callable[[Any], dict[str, Any]]
 
 
-PARTS: tuple[Part, ...] = ()
+PARTS = (
+    Part(filtered.drive, filtered.judged, filtered.figures),
+    Part(uav.drive, uav.judged, uav.figures),
+)
 """Sections IV-C and V."""
 
 
 class Amount(NamedTuple):
-    """How much is drawn: the whole study, or less of it. ``seeds`` are those of `PARTS`."""
+    """How much is drawn: the whole study, or less of it.
+
+    ``seeds`` are those of `PARTS`; 0 leaves them out.
+    """
 
     cases: int = 400
     solved: int = 40
@@ -52,7 +60,7 @@ class Amount(NamedTuple):
     trials: int = coding.TRIALS
     coded: int = design.CODED
     plants: int = 200
-    seeds: int = 8
+    seeds: int = uav.SEEDS
 
 
 class Run(NamedTuple):
@@ -77,7 +85,7 @@ def drive(amount: Amount) -> Run:
         {p: coding.curve(p, *lots) for p in coding.SENSORS},
         coding.wide(*lots),
         {kind: design.isometry(kind, amount.coded) for kind in coding.KINDS},
-        tuple(part.drive(amount.seeds) for part in PARTS),
+        tuple(part.drive(amount.seeds) for part in PARTS if amount.seeds),
     )
 
 
@@ -89,7 +97,8 @@ def study(amount: Amount = Amount()) -> Study:  # noqa: B008
 
 def judged(run: Run) -> tuple[Row, ...]:
     """All rows in the paper's order."""
-    further = [row for part, own in zip(PARTS, run.parts, strict=True) for row in part.judged(own)]
+    parts = zip(PARTS[: len(run.parts)], run.parts, strict=True)
+    further = [row for part, own in parts for row in part.judged(own)]
     rows = [*measured(run), *counted(run.cases), *statements(), *further]
     return tuple(sorted(rows, key=_place))
 
@@ -210,6 +219,6 @@ def figures(run: Run) -> dict[str, Any]:
         name: against(run.curves[10].S if name.endswith("1") else longest, panels, label)
         for name, panels in drawn.items()
     }
-    for part, its in zip(PARTS, run.parts, strict=True):
+    for part, its in zip(PARTS[: len(run.parts)], run.parts, strict=True):
         own |= part.figures(its)
     return own
