@@ -422,6 +422,7 @@ norm = "NORM"
 [detector]
 kind = "chi_square"
 level = 0.01
+threshold = "paper"
 """
 
 

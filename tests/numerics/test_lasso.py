@@ -361,7 +361,6 @@ def test_batch_equals_one_by_one():
     for i in range(50):
         one, kept = alone(Z, w[i], c[i], empty(Z))
         two, _ = alone(Z, w[i], c[::-1][i], kept)
-        for both in zip(found, one, strict=True):
-            np.testing.assert_array_equal(both[0][i], both[1])
-        for both in zip(again, two, strict=True):
-            np.testing.assert_array_equal(both[0][i], both[1])
+        # one program or another may add in another order, by processor
+        for both in (*zip(found, one, strict=True), *zip(again, two, strict=True)):
+            np.testing.assert_allclose(both[0][i], both[1], rtol=1e-12, atol=1e-24)

@@ -16,7 +16,7 @@ from holdfast.numerics.stacked import (
     stacked_noise,
 )
 from holdfast.parts import step_zero
-from holdfast.plants.linear import LinearPlant, Matrices
+from holdfast.plants.linear import LinearPlant, Matrices, Matrix, Table
 from holdfast.records import Observation
 
 
@@ -111,8 +111,7 @@ class DecoderWindow(eqx.Module):
         if self.laid is not None or rows.matrices is None:
             assert self.laid is not None
             laid, T = self.laid, self.length
-            A = jnp.broadcast_to(jnp.asarray(self.plant.A), (T, *laid.last.shape))
-            C = jnp.broadcast_to(jnp.asarray(self.plant.C), (T, *jnp.shape(self.plant.C)))
+            A, C = (_repeated(m, T) for m in (self.plant.A, self.plant.C))
         else:
             laid, A, C = laid_out(rows.matrices), rows.matrices.A, rows.matrices.C
         moved, at_last = forced(A, C, rows.push, rows.direct)
@@ -142,9 +141,15 @@ def decoder_window(plant: LinearPlant, length: int, honest) -> DecoderWindow:
     laid = None
     if plant.constant:
         each = (plant.A, plant.C, plant.Q, plant.R)
-        stack = Matched(*(jnp.broadcast_to(m, (length, *jnp.shape(m))) for m in each))
+        stack = Matched(*(_repeated(m, length) for m in each))
         laid = jax.jit(laid_out)(stack)
     return DecoderWindow(plant, jnp.asarray(honest), laid, length)
+
+
+def _repeated(matrix: Matrix, length: int) -> Array:
+    """One for every row; of a constant plant."""
+    assert not isinstance(matrix, Table)
+    return jnp.broadcast_to(matrix, (length, *matrix.shape))
 
 
 def _shifted(rows: Array, new: Array) -> Array:

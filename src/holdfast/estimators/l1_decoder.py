@@ -11,7 +11,6 @@ Diggavi (IEEE TAC 2014) for the norms per sensor.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -67,7 +66,7 @@ class DecoderState(eqx.Module):
     gap: Float[Array, ""]
 
 
-class Decoded(NamedTuple):
+class Decoded(eqx.Module):
     """``first`` (n,): the state at the window's first row; ``lead``, ``gain``, ``pulled``: how
     noise and attacks move it (`holdfast.numerics.spread`); ``known``: whether that is known.
     """
@@ -111,7 +110,7 @@ class L1Decoder(Estimator):
         T, p, n = self.window.length, len(self.plant.outputs), len(self.plant.states)
         state = DecoderState(
             self.window.init(), self.x0, jnp.zeros((T, p)), jnp.zeros((T, p), bool),
-            jnp.zeros((LISTED, n)), *[jnp.asarray(0, jnp.int32)] * 2, jnp.zeros(()),
+            jnp.zeros((LISTED, n)), _integer(0), _integer(0), jnp.zeros(()),
         )  # fmt: skip
         nothing = jnp.zeros(p), jnp.zeros((p, p)), 0
         return state, Estimate.without_attack(self.x0, self.P0, *nothing, a=jnp.zeros(p))
