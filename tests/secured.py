@@ -181,7 +181,8 @@ class Paper(NamedTuple):
         settings.max_iter = 500
         A, P = sp.csc_matrix(np.vstack(rows)), sp.csc_matrix(np.triu(residual.T @ residual))
         found = clarabel.DefaultSolver(P, q, A, np.zeros(A.shape[0]), cones, settings).solve()
-        assert str(found.status) in ("Solved", "AlmostSolved"), found.status
+        # at these tolerances the last step may bring nothing; what it is worth the comparison says
+        assert str(found.status) in ("Solved", "AlmostSolved", "InsufficientProgress"), found.status
         return unit * np.array(found.x)[:n]
 
     def violation(self, zeta, x, f, S, b, gamma: float, norm: str) -> float:
