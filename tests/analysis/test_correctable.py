@@ -2,6 +2,7 @@
 
 import itertools
 
+import jax
 import numpy as np
 import pytest
 from scipy.linalg import block_diag, null_space
@@ -12,6 +13,7 @@ from holdfast.analysis import correctable as module
 from holdfast.analysis import windows
 from holdfast.analysis.correctable import correctable
 from holdfast.analysis.supports import cancellations, fewest_samples, sharper, theorem_1
+from holdfast.numerics.l1_regression import l1_regression
 from holdfast.numerics.ratio_bounds import bounded, largest
 from holdfast.numerics.rays import worst
 from holdfast.numerics.zero_patterns import counted
@@ -151,19 +153,21 @@ def test_ratios_are_those_of_linear_programmes():
 
 @pytest.mark.parametrize(("seed", "n", "p", "T"), [(0, 2, 4, 3), (1, 3, 5, 4), (2, 2, 5, 2)])
 def test_what_is_certain_is_decoded(seed, n, p, T):
-    """Random attacks, large and small, at other sensors at every step; and the worst one."""
+    """Random attacks, large and small, at other sensors at every step, by the product's decoder."""
     rng = np.random.default_rng(seed)
     A, C = rng.normal(size=(n, n)), rng.choice([-1.0, 1.0], (p, n)) * rng.uniform(1, 1.5, (p, n))
     A *= 0.9 / np.abs(np.linalg.eigvals(A)).max()
     found, Phi = correctable(of(A, C), T), window_of(A, C, T)
     q = found.l1.exact
-    assert found.most > 0
     assert q is not None
+    assert q > 0
+    solve = jax.jit(l1_regression)
     for _ in range(60):
         x, e = rng.normal(size=n), np.zeros((T, p))
         for t in range(T):
             e[t, rng.permutation(p)[:q]] = 10.0 ** rng.uniform(-3, 6) * rng.normal(size=q)
-        np.testing.assert_allclose(decoded(Phi, Phi @ x + e.ravel()), x, atol=1e-5)
+        # samples of 1e6 are held to 1e-10, and states are at most some ten times less exact
+        np.testing.assert_allclose(solve(Phi, Phi @ x + e.ravel()).x, x, atol=1e-9)
 
 
 def test_errata_1():
