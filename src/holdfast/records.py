@@ -57,6 +57,7 @@ class Reason(IntEnum):
     RESIDUAL_CHANNEL = 10
     IMPOSSIBLE = 11
     ATTACK_HELD_SUM = 12
+    FORGED = 13
 
     @property
     def words(self) -> str:
@@ -78,6 +79,7 @@ _REASON_WORDS = {
     Reason.RESIDUAL_CHANNEL: "measurement contradicts the model at",
     Reason.IMPOSSIBLE: "no attack within the limits explains what is measured",
     Reason.ATTACK_HELD_SUM: "projected attack estimates have added up",
+    Reason.FORGED: "a message that had to be authenticated was not",
 }
 
 
@@ -142,6 +144,33 @@ def screen(observation: Observation, u_before: Float[Array, " nu"]) -> Observati
         trusted=observation.trusted & usable,
         status=status.astype(jnp.int32),
     )
+
+
+class Enforcement(eqx.Module):
+    """Which outputs are authenticated when: at the steps k >= first with (k - first) mod every
+    < duration, for each output its own; never where ``duration`` is 0.
+    """
+
+    every: Int[Array, " ny"]
+    duration: Int[Array, " ny"]
+    first: Int[Array, " ny"]
+
+    @classmethod
+    def of(cls, every, duration, first) -> "Enforcement":
+        """From one whole number per output each, or one for all of a list's length."""
+        found = np.broadcast_arrays(*(np.asarray(v, np.int32) for v in (every, duration, first)))
+        return cls(*(np.array(v) for v in found))
+
+    def at(self, k: Int[Array, "*t"]) -> Bool[Array, "*t ny"]:
+        """Whether each output is authenticated at step ``k`` (or at each of several)."""
+        since = jnp.asarray(k)[..., None] - self.first
+        return (since >= 0) & (jnp.mod(since, jnp.maximum(self.every, 1)) < self.duration)
+
+    @property
+    def share(self) -> Float[Array, " ny"]:
+        """The share of each output's messages that is authenticated in the long run."""
+        every = np.maximum(np.asarray(self.every), 1)
+        return np.minimum(np.asarray(self.duration) / every, 1.0)
 
 
 class Estimate(eqx.Module):
