@@ -22,8 +22,8 @@ TREES = {name: ast.parse(path.read_text()) for name, path in FILES.items()}
 PARTS = {"plants", "controllers", "attacks", "estimators"}
 BELOW = {"records", "numerics"}
 CORE = {
-    *BELOW, "parts", *PARTS, "detectors", "analysis", "loop", "evaluate", "catalog", "campaign",
-    "testing",
+    *BELOW, "parts", *PARTS, "detectors", "analysis", "loop", "auth", "evaluate", "catalog",
+    "campaign", "reach", "testing",
 }  # fmt: skip
 MAY_IMPORT = {
     "records": set(),
@@ -32,13 +32,17 @@ MAY_IMPORT = {
     "plants": {*BELOW, "parts"},
     **{group: {*BELOW, "parts", "plants"} for group in ("controllers", "attacks", "estimators")},
     "detectors": {*BELOW, "parts"},
-    "analysis": {*BELOW, "parts", "plants", "controllers", "estimators", "detectors"},
+    **{
+        group: {*BELOW, "parts", "plants", "controllers", "estimators", "detectors"}
+        for group in ("analysis", "reach")
+    },
     "loop": {"records", "parts"},
+    "auth": {"records"},
     "evaluate": BELOW,
     "catalog": {*PARTS, "detectors"},
     "testing": {*BELOW, "parts", "plants", "loop"},
-    "campaign": CORE - {"testing"},
-    "report": {"records", "evaluate", "campaign"},
+    "campaign": CORE - {"auth", "reach", "testing"},
+    "report": {"records", "evaluate", "campaign", "reach"},
     "papers": {*CORE, "report"} - {"testing"},
     "shell": {*CORE, "report", "papers"} - {"testing"},
 }

@@ -12,7 +12,7 @@ from holdfast.detectors import chi_square
 from holdfast.estimators import kalman, unknown_input
 from holdfast.loop import Monitor, Scenario, replay, simulate
 from holdfast.plants.build import linear_plant
-from holdfast.records import Observation, Status
+from holdfast.records import Enforcement, Observation, Status
 from holdfast.shell.live import Live
 
 
@@ -152,3 +152,83 @@ def test_the_simulated_truth_stops_at_the_limits():
     injected = np.asarray(trace.injection.d)[:, 0]
     np.testing.assert_allclose(injected[6:], 2.0, rtol=1e-12)
     assert np.all(injected[:3] == 0.0)
+
+
+def falsified():
+    """Two sensors of a random walk; channels: a lie to the first, a lie to both, a push that the
+    second sensor feels at once.
+    """
+    return linear_plant(
+        A=[[1.0]], B=[[2.0]], C=[[1.0], [1.0]], D=[[0.0], [0.5]], G=[[0.0, 0.0, 3.0]],
+        H=[[5.0, 1.0, 0.0], [0.0, 1.0, 7.0]], Q=[[0.01]], R=0.04 * np.eye(2),
+        states=["x"], inputs=["accel"], outputs=["gps", "odometer"],
+        attacks=["spoof", "jam", "push"],
+    )  # fmt: skip
+
+
+EVERYTHING = [
+    "sensor:gps", "sensor:odometer", "actuator:accel",
+    "channel:spoof", "channel:jam", "channel:push",
+]  # fmt: skip
+
+
+def enforced(enforcement, attacked=EVERYTHING, steps=12):
+    plant = falsified()
+    monitor = Monitor(kalman.build(plant, [0.0], [[1.0]]), chi_square.build(plant))
+    attacks = (bias.build(plant, channels=attacked, value=1.0),) if attacked else ()
+    scenario = Scenario(plant, jnp.zeros(1), monitor, None, attacks, enforcement)
+    return simulate(scenario, jax.random.key(3), steps)
+
+
+def test_an_authenticated_sample_arrives_as_it_was_sent():
+    """gps at 3, 4, 7, 8, 11, 12, odometer at 2, 5, 8, 11; what moves the state goes on."""
+    k = np.arange(1, 13)
+    trusted = np.stack([(k >= 3) & ((k - 3) % 4 < 2), (k >= 2) & ((k - 2) % 3 < 1)], 1)
+    none = enforced(None)
+    some = enforced(Enforcement.of([4, 3], [2, 1], [3, 2]))
+    np.testing.assert_array_equal(some.observation.trusted, trusted)
+    assert not np.any(none.observation.trusted)
+    np.testing.assert_array_equal(some.x, none.x)
+    # the same noise in all: what is left beside C x is what was falsified
+    noise = enforced(None, None)
+    free = noise.observation.y - noise.x
+    lies = np.asarray(some.observation.y - some.x - free)
+    actuator = np.array([0.0, 0.5])  # D times the push is there, authenticated or not
+    np.testing.assert_allclose(lies, np.where(trusted, 0, [7.0, 9.0]) + actuator, atol=1e-12)
+    np.testing.assert_array_equal(some.injection.y, np.where(trusted, 0.0, 1.0))
+    np.testing.assert_array_equal(some.injection.u, np.ones((12, 1)))
+    # a channel counts as used unless nothing of it arrives anywhere
+    reached = [~trusted[:, 0], ~(trusted[:, 0] & trusted[:, 1]), np.ones(12, bool)]
+    np.testing.assert_array_equal(some.injection.d, np.stack(reached, 1).astype(float))
+
+
+def test_authentication_alone_changes_no_number():
+    never, always = (Enforcement.of([5, 5], n, [1, 1]) for n in (0, 5))
+    plain = enforced(None, None)
+    for found in (enforced(never, None), enforced(always, None)):
+        np.testing.assert_array_equal(found.observation.y, plain.observation.y)
+        np.testing.assert_array_equal(found.estimate.x, plain.estimate.x)
+    for mine, theirs in zip(
+        jax.tree.leaves(enforced(never)), jax.tree.leaves(enforced(None)), strict=True
+    ):
+        np.testing.assert_array_equal(mine, theirs)
+
+
+def test_an_estimator_that_relies_on_authentication_is_right_to():
+    """`unknown_input` takes H d = 0 where a sample is trusted: the simulation means the same."""
+    plant = linear_plant(
+        A=[[0.9]], C=[[1.0]], H=[[1.0]], Q=[[0.01]], R=[[0.04]], outputs=["gps"], attacks=["spoof"]
+    )
+    monitor = Monitor(unknown_input.build(plant, [0.0], [[1.0]]), chi_square.build(plant))
+    attack = bias.build(plant, channel="channel:spoof", value=50.0)
+    scenario = Scenario(
+        plant, jnp.zeros(1), monitor, None, (attack,), Enforcement.of([3], [1], [3])
+    )
+    trace = simulate(scenario, jax.random.key(0), 300)
+    sd = np.sqrt(np.asarray(trace.estimate.x_cov)[:, 0, 0])
+    off = (np.asarray(trace.estimate.x) - np.asarray(trace.x))[:, 0]
+    # 300 errors that are correlated over a few rows: within 20 % of the covariance, all under 5 sd
+    assert np.sqrt(np.mean((off / sd) ** 2)) == pytest.approx(1.0, abs=0.2)
+    assert np.max(np.abs(off / sd)) < 5.0
+    np.testing.assert_array_equal(trace.estimate.d[2::3], 0.0)
+    np.testing.assert_array_equal(trace.injection.d[2::3], 0.0)

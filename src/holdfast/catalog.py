@@ -6,7 +6,18 @@ The keys of a scenario's table are the keyword parameters of the function listed
 from collections.abc import Callable
 from typing import Any
 
-from holdfast.attacks import bias, delay, freeze, hopping, noise, ramp, replay, sine
+from holdfast.attacks import (
+    bias,
+    covert,
+    delay,
+    freeze,
+    hopping,
+    noise,
+    ramp,
+    replay,
+    sine,
+    zero_dynamics,
+)
 from holdfast.controllers import feedback, pole_placement
 from holdfast.detectors import (
     care_paper,
@@ -29,7 +40,15 @@ from holdfast.estimators import (
     unscented,
 )
 from holdfast.plants import build
-from holdfast.plants.library import bicycle, five_sensors, gps_imu, quadrotor, uav
+from holdfast.plants.library import (
+    bicycle,
+    dcacc,
+    five_sensors,
+    gps_imu,
+    quadrotor,
+    uav,
+    vehicle_tracking,
+)
 
 Builders = dict[str, Callable[..., Any]]
 
@@ -40,6 +59,8 @@ PLANTS: Builders = {
     "five_sensors": five_sensors.build,
     "quadrotor": quadrotor.build,
     "gps_imu": gps_imu.build,
+    "vehicle_tracking": vehicle_tracking.build,
+    "dcacc": dcacc.build,
 }
 
 ESTIMATORS: Builders = {
@@ -73,6 +94,8 @@ ATTACKS: Builders = {
     "replay": replay.build,
     "delay": delay.build,
     "freeze": freeze.build,
+    "covert": covert.build,
+    "zero_dynamics": zero_dynamics.build,
 }
 
 CONTROLLERS: Builders = {

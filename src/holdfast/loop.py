@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from holdfast.parts import Attack, Controller, Detector, Estimator, Plant
 from holdfast.records import (
+    Enforcement,
     Estimate,
     Injection,
     Knowledge,
@@ -37,13 +38,17 @@ class Monitor(eqx.Module):
 
 
 class Scenario(eqx.Module):
-    """A plant that starts at ``x0``, whoever steers it, attacks it and watches it."""
+    """A plant that starts at ``x0``, whoever steers it, attacks it and watches it.
+
+    ``enforcement``: which outputs are authenticated when; None for never.
+    """
 
     plant: Plant
     x0: Float[Array, " n"]
     monitor: Monitor
     controller: Controller | None = None
     attacks: tuple[Attack, ...] = ()
+    enforcement: Enforcement | None = None
 
 
 def monitor_step(
@@ -114,6 +119,13 @@ def simulate(scenario: Scenario, key: PRNGKeyArray, steps: int) -> Trace:
     clean sample of k and injects into it, the monitor sees the result. ``Trace.injection`` of
     row k is what was injected at k, ``Trace.x`` the true state at k. Where the plant has
     limits the state stops at them, and an attack that asks for more than they allow saturates.
+
+    An output that is authenticated at k (``Scenario.enforcement``) arrives as the sensor sent it:
+    C x + D u + H 0 + v. Neither an injection into it nor an attack channel that falsifies it
+    through H gets there, as every estimator takes it of a trusted sample, and the trace holds 0
+    for them: for ``injection.y``, and for a channel that reaches nothing else at k. What an
+    attack does to actuators and to the state is physics, which no signature stops: u (its D
+    part included) and G d act as ever. The attacker is not told.
     """
     plant, monitor = scenario.plant, scenario.monitor
     attack_key, run_key = jax.random.split(key)
@@ -143,9 +155,16 @@ def simulate(scenario: Scenario, key: PRNGKeyArray, steps: int) -> Trace:
         attack_states, injected = _inject(
             scenario.attacks, attack_states, Knowledge(k, u, clean), zero_d
         )
-        y = plant.measure(measure_key, k, x, u + injected.u, injected.d) + injected.y
+        y = plant.measure(measure_key, k, x, u + injected.u, injected.d)
         everything = jnp.ones(y.shape, bool)
-        observation = Observation(u, y, everything, ~everything, jnp.asarray(0, jnp.int32))
+        trusted = ~everything
+        if scenario.enforcement is not None:
+            trusted = scenario.enforcement.at(k)
+            sent = plant.measure(measure_key, k, x, u + injected.u, zero_d)
+            y = jnp.where(trusted, sent, y)
+            injected = _let_through(plant, k, x, u, injected, trusted)
+        y = y + injected.y
+        observation = Observation(u, y, everything, trusted, jnp.asarray(0, jnp.int32))
         state, (estimate, verdict) = monitor_step(monitor, state, observation)
         u = command(estimate)
         injected = _saturated(plant, k + 1, u, injected)
@@ -161,6 +180,19 @@ def simulate(scenario: Scenario, key: PRNGKeyArray, steps: int) -> Trace:
 def _saturated(plant: Plant, k, u, injected: Injection) -> Injection:
     """What of an injection the limits of the plant let through over the interval up to k."""
     return eqx.tree_at(lambda i: i.d, injected, plant.saturated(k, u, injected.d))
+
+
+def _let_through(plant: Plant, k, x, u, injected: Injection, trusted) -> Injection:
+    """What of an injection at k is left where the ``trusted`` outputs arrive as they were sent."""
+    through_y = jnp.where(trusted, 0.0, injected.y)
+    d = injected.d
+    if d.shape[0]:
+        falsified = jax.jacfwd(lambda e: plant.output(k, x, u, e))(d) != 0
+        moved = jax.jacfwd(lambda e: plant.transition(k + 1, x, u, e))(d) != 0
+        stopped = jnp.any(falsified & trusted[:, None], 0)
+        felt = jnp.any(falsified & ~trusted[:, None], 0) | jnp.any(moved, 0)
+        d = jnp.where(stopped & ~felt, 0.0, d)
+    return Injection(injected.u, through_y, d)
 
 
 def _delay(monitor: Monitor) -> int:

@@ -163,7 +163,7 @@ class Enforcement(eqx.Module):
 
     def at(self, k: Int[Array, "*t"]) -> Bool[Array, "*t ny"]:
         """Whether each output is authenticated at step ``k`` (or at each of several)."""
-        since = jnp.asarray(k)[..., None] - self.first
+        since = jnp.asarray(k, jnp.int32)[..., None] - self.first
         return (since >= 0) & (jnp.mod(since, jnp.maximum(self.every, 1)) < self.duration)
 
     @property

@@ -214,3 +214,81 @@ def test_what_decoders_correct_is_two_numbers(tmp_path, command):
     assert said["relaxed"] == 5
     assert any("l0 corrects 1 attack per step" in text for text in found["advice"])
     assert all(math.isfinite(number) for number in numbers(found))
+
+
+CALM = SCENARIO.replace("G = [[0.005], [0.1]]\n", "").replace('attacks = ["accel_attack"]\n', "")
+"""The cart without attack channels."""
+
+
+def test_who_moves_the_filter_unseen(folder, command):
+    code, out, err = command(
+        "analyse", folder / "scenario.toml", "--compromised", "wheel, gps", "--json"
+    )
+    assert (code, err) == (0, "")
+    found = json.loads(out, parse_constant=lambda word: pytest.fail(f"{word} in the JSON"))
+    assert found["attackable"] == {"gps": True, "wheel": False, "wheel,gps": True, "all": True}
+    how = found["attackable_how"]
+    assert set(how) == {
+        "radius", "modes", "theorem_4", "corollary_2", "smallest", "shields", "reason",
+    }  # fmt: skip
+    assert how["radius"] == {"gps": 1.0, "wheel": 0.0, "wheel,gps": 1.0, "all": 1.0}
+    (mode,) = how["modes"]["gps"]
+    assert (mode["z"], mode["multiplicity"]) == ([1.0, 0.0], 1)
+    assert mode["directions"] == [{"position": 1.0, "speed": 0.0}]
+    assert (how["theorem_4"], how["corollary_2"]["wheel"], how["reason"]) == (1, 0, None)
+    assert how["smallest"] == {"longest": 100, "usual": 1, "others": {}}
+    assert how["shields"] == ["gps"]
+    assert all(math.isfinite(number) for number in numbers(found))
+
+
+def test_stealth_is_told_of_where_it_is_asked_for(folder, command):
+    (folder / "calm.toml").write_text(CALM)
+    _, out, _ = command("analyse", folder / "calm.toml")
+    assert re.search(r"altered +stealthy error +modes", out)
+    assert re.search(r"gps +without limit +1", out)
+    assert re.search(r"wheel +bounded", out)
+    assert 'who alters "gps" can move the estimate along position without limit (mode 1).' in out
+    # with attack channels it is told only on request; a decoder's scenario likewise
+    _, out, _ = command("analyse", folder / "scenario.toml")
+    assert "stealthy" not in out
+    _, out, _ = command("analyse", folder / "scenario.toml", "--compromised", "all")
+    assert re.search(r"all +without limit +1 \(2 times\)", out)
+    assert 'Authenticating "gps" and "wheel" for 1 step in every L bounds this' in out
+    path = folder / "hopping.toml"
+    path.write_text(HOPPING)
+    _, out, _ = command("analyse", path)
+    assert "stealthy" not in out
+
+
+BY_NAME = "expected all by itself, or names with commas between: one of 'gps', 'wheel'"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("gsp", f"found 'gsp', {BY_NAME}; did you mean 'gps'?"),
+        ("", f"found an empty name in '', {BY_NAME}"),
+        ("gps,", f"found an empty name in 'gps,', {BY_NAME}"),
+        ("gps,wheel,gps", "found 'gps' twice, expected every output once"),
+        ("all,gps", f"found 'all', {BY_NAME}"),
+    ],
+)
+def test_names_that_are_none(folder, command, text, expected):
+    code, out, err = command("analyse", folder / "scenario.toml", "--compromised", text, "--json")
+    assert (code, out) == (2, "")
+    assert err.startswith("--compromised: ")
+    assert expected in err
+    assert err.count("\n") == 1
+
+
+def test_no_gain_is_null_for_every_name(folder, command):
+    """Only the speed is measured, twice: there is no steady-state filter."""
+    text = SCENARIO.replace("C = [[1.0, 0.0], [0.0, 1.0]]", "C = [[0.0, 1.0], [0.0, 1.0]]")
+    (folder / "speed.toml").write_text(text)
+    code, out, _ = command("analyse", folder / "speed.toml", "--compromised", "gps,wheel", "--json")
+    assert code == 0
+    found = json.loads(out)
+    assert found["attackable"] == dict.fromkeys(["gps", "wheel", "gps,wheel", "all"])
+    assert "no steady-state" in found["attackable_how"]["reason"]
+    assert found["attackable_how"]["radius"]["all"] is None
+    assert "cannot be said" in found["advice"][-1]

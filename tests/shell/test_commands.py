@@ -79,11 +79,14 @@ def test_a_template_of_every_kind_loads(kind, tmp_path):
         assert f'kind = "{kind}"' in text
     # what is commented out is real: every key shown can be given
     given = re.sub(
-        r"^# (?!state |attack |calibrate )([a-z_]+ = (?!\.\.))", r"\1", text, flags=re.MULTILINE
+        r"^# (?!state |attack |calibrate )((?:[a-z_]+ = (?!\.\.))|\[enforcement\])",
+        r"\1",
+        text,
+        flags=re.MULTILINE,
     )
     assert "\n# " in text
     path.write_text(given)
-    read_scenario(path)
+    assert read_scenario(path).scenario.enforcement is not None
 
 
 def test_the_template_runs(tmp_path, command):

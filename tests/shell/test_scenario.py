@@ -3,17 +3,25 @@
 import subprocess
 import sys
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.io
 
+from holdfast import catalog
+from holdfast.attacks import bias
 from holdfast.attacks.window import Window
 from holdfast.detectors.chi_square import ChiSquare
 from holdfast.estimators.kalman import Kalman
+from holdfast.loop import simulate
+from holdfast.parts import Plant
 from holdfast.plants.linear import Table
+from holdfast.records import Enforcement
 from holdfast.shell.errors import InputError
 from holdfast.shell.files import load_scenario, read_scenario
+from holdfast.shell.schema import model_of
+from holdfast.shell.template import scenario_text
 from shell_samples import SCENARIO
 
 A = [[1.0, 0.1], [0.0, 1.0]]
@@ -43,6 +51,7 @@ def test_the_parts_are_what_the_file_says(folder):
     assert [type(a) for a in scenario.attacks] == [Window]
     assert (found.run.steps, found.run.runs, found.run.seed) == (30, 1, 0)
     assert scenario.controller is None
+    assert scenario.enforcement is None
 
 
 def test_defaults(folder):
@@ -136,6 +145,105 @@ def test_controller(folder):
     )
     controller = load(folder, ("[run]", text)).scenario.controller
     assert controller.gain.shape == (1, 2)
+
+
+# a table, and every, for, first for gps and for wheel
+ENFORCEMENTS = {
+    "every alone": ("every = 20", [(20, 1, 20), (20, 1, 20)]),
+    "all keys": ("every = 20\nfor = 3\nfirst = 7", [(20, 3, 7), (20, 3, 7)]),
+    "always": ("every = 1\nfor = 5", [(1, 5, 1), (1, 5, 1)]),
+    "one sensor": ("[enforcement.sensors.wheel]\nevery = 4\nfor = 2", [(1, 0, 1), (4, 2, 4)]),
+    "each its own": (
+        "[enforcement.sensors.wheel]\nevery = 4\nfirst = 1\n[enforcement.sensors.gps]\nevery = 9",
+        [(9, 1, 9), (4, 1, 1)],
+    ),
+    "one on its own": (
+        "every = 20\nfor = 3\nfirst = 7\n[enforcement.sensors.gps]\nevery = 5",
+        [(5, 1, 5), (20, 3, 7)],
+    ),
+}
+
+
+@pytest.mark.parametrize("which", ENFORCEMENTS)
+def test_enforcement(which, folder):
+    text, wanted = ENFORCEMENTS[which]
+    found = load(folder, ("[run]", f"[enforcement]\n{text}\n\n[run]")).scenario.enforcement
+    np.testing.assert_array_equal(found.every, [row[0] for row in wanted])
+    np.testing.assert_array_equal(found.duration, [row[1] for row in wanted])
+    np.testing.assert_array_equal(found.first, [row[2] for row in wanted])
+    k = np.arange(1, 60, dtype=np.int32)
+    on = [[n >= first and (n - first) % every < count for every, count, first in wanted] for n in k]
+    np.testing.assert_array_equal(found.at(k), on)
+
+
+def test_enforcement_reaches_the_run(folder):
+    """A lie of 5 for ten rows, of which every other one cannot be told."""
+    found = load(folder, ("[run]", "[enforcement]\nevery = 2\n\n[run]"))
+    trace = simulate(found.scenario, jax.random.key(0), found.run.steps)
+    k = np.arange(1, 31)
+    injected = np.where((k >= 10) & (k < 20) & (k % 2 == 1), 5.0, 0.0)
+    np.testing.assert_array_equal(np.asarray(trace.injection.y)[:, 0], injected)
+    np.testing.assert_array_equal(np.asarray(trace.observation.trusted)[:, 0], k % 2 == 0)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", ["enforcement.every", "nothing", "a whole number from 1 up"]),
+        ("for = 2", ["enforcement.every", "nothing", "a whole number from 1 up"]),
+        ("every = 0", ["enforcement.every", "found 0", "a whole number from 1 up"]),
+        ("every = 2.0", ["enforcement.every", "found 2.0", "a whole number from 1 up"]),
+        ("every = true", ["enforcement.every", "found True", "a whole number from 1 up"]),
+        ("every = 2\nfor = 0", ["enforcement.for", "found 0", "a whole number from 1 up"]),
+        ("every = 2\nfor = 'a'", ["enforcement.for", "found 'a'", "a whole number from 1 up"]),
+        ("every = 2\nfirst = -1", ["enforcement.first", "found -1", "a whole number from 1 up"]),
+        ("every = 3000000000", ["enforcement.every", "found 3000000000"]),
+        ("evry = 2", ["enforcement.evry", "an unknown key", "did you mean 'every'"]),
+        ("every = 2\nduration = 1", ["enforcement.duration", "unknown key", "'every', 'for'"]),
+        ("sensors = {}", ["enforcement.every", "nothing"]),
+        ("sensors = 3", ["enforcement.sensors", "found 3", "[enforcement.sensors.NAME]"]),
+        ("sensors = { gps = 3 }", ["enforcement.sensors", "[enforcement.sensors.NAME]"]),
+        (
+            "[enforcement.sensors.gsp]\nevery = 2",
+            ["enforcement.sensors.gsp", "an unknown sensor", "'gps', 'wheel'", "mean 'gps'"],
+        ),
+        ("[enforcement.sensors.gps]\nfor = 2", ["enforcement.sensors.gps.every", "nothing"]),
+        (
+            "[enforcement.sensors.gps]\nevery = 2\nform = 1",
+            ["enforcement.sensors.gps.form", "an unknown key", "did you mean 'for'"],
+        ),
+        ("every = 5\n[enforcement.sensors.gps]\nevery = 0", ["sensors.gps.every", "found 0"]),
+    ],
+)
+def test_enforcement_that_cannot_be(text, words, folder, command):
+    (folder / "changed.toml").write_text(SCENARIO.replace("[run]", f"[enforcement]\n{text}\n[run]"))
+    code, out, err = command("run", folder / "changed.toml")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    for word in ["changed.toml", "found", "expected", *words]:
+        assert word in err
+
+
+def test_an_attack_may_ask_for_the_enforcement(folder, monkeypatch):
+    """What a builder's parameter ``enforcement`` gets is the scenario's, and no table sets it."""
+    given = []
+
+    def build(plant: Plant, *, value: float, enforcement: Enforcement | None, channel: str):
+        given.append(enforcement)
+        return bias.build(plant, value=value, channel=channel)
+
+    monkeypatch.setitem(catalog.ATTACKS, "aware", build)
+    aware = (
+        '"bias"\nchannel = "sensor:gps"\nstart = 1.0\nstop = 2.0',
+        '"aware"\nchannel = "sensor:gps"',
+    )
+    load(folder, aware)
+    found = load(folder, aware, ("[run]", "[enforcement]\nevery = 3\n\n[run]"))
+    assert given[0] is None
+    assert given[1] is found.scenario.enforcement
+    assert "enforcement" not in model_of(build, 1).model_fields
+    assert "\nenforcement" not in scenario_text("aware")
+    with pytest.raises(InputError, match=r"attack\[1\].enforcement: found an unknown key"):
+        load(folder, aware, ("value = 5.0", "value = 5.0\nenforcement = { every = 2 }"))
 
 
 def test_python_target(folder):

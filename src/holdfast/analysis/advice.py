@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from holdfast.analysis.attackable_advice import on_attackable
 from holdfast.analysis.attacks import Channel
 from holdfast.analysis.decoding_advice import on_decoding
 from holdfast.analysis.fusion import CERTAIN, Fusion
@@ -11,12 +12,17 @@ from holdfast.analysis.zeros import Zero
 
 
 def advice(
-    found: Analysis, delay: int | None, fusion: bool = False, decoding: bool = False
+    found: Analysis,
+    delay: int | None,
+    fusion: bool = False,
+    decoding: bool = False,
+    stealth: bool = False,
 ) -> list[str]:
     """The sentences, most basic first; ``delay`` is the estimator's, None where it has none.
 
     ``fusion``: whether to say what the fusion of local estimates withstands; ``decoding``:
-    what the decoders of a window correct.
+    what the decoders of a window correct; ``stealth``: how far a stealthy attacker of sensors
+    moves the Kalman filter.
     """
     said = [f"This holds for {found.model.note}."] if found.model.note else []
     said += _on_state(found)
@@ -30,6 +36,8 @@ def advice(
         said += _on_fusion(found.fusion)
     if decoding:
         said += on_decoding(found.decoding, found.model.states)
+    if stealth:
+        said += on_attackable(found.attackable, found.model.states)
     return said
 
 

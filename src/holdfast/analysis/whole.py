@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from holdfast.analysis.attackable import Attackable, attackable
 from holdfast.analysis.attacks import Identifiability, identifiability, undetermined_steps
 from holdfast.analysis.boundedness import Bounds, bounds
 from holdfast.analysis.fusion import Fusion, fusion
@@ -30,7 +31,7 @@ class Window(NamedTuple):
 class Analysis(NamedTuple):
     """``bounds``: at delay 0 and at the smallest delay that identifies what can be; none
     without attack channels. ``window``: only for per-step matrices. ``decoding``: of the
-    decoders' window, whatever the estimator is.
+    decoders' window, ``attackable``: of the steady-state Kalman filter, whatever the estimator is.
     """
 
     model: Model
@@ -41,6 +42,7 @@ class Analysis(NamedTuple):
     window: Window | None
     fusion: Fusion
     decoding: Decoding
+    attackable: Attackable
 
 
 def analysis(
@@ -50,17 +52,20 @@ def analysis(
     window: int | None = None,
     trusted: tuple[int, ...] = (),
     weighted: bool = False,
+    compromised: tuple[int, ...] | None = None,
 ) -> Analysis:
     """What can be said of ``plant`` near ``x0`` (n,), starting from the covariance ``P0``.
 
     ``window``: steps that a decoder looks at, n if there is none; ``trusted``: outputs that are
-    always authenticated; ``weighted``: whether it divides each sample by its deviation.
+    always authenticated; ``weighted``: whether it divides each sample by its deviation;
+    ``compromised``: outputs that a stealthy attacker alters, beside all and each alone.
     """
     model = model_at(plant, x0)
     window = len(model.A) if window is None else window
     weight = noise_weights(model, window) if weighted else None
     attacks = identifiability(model)
     delays = sorted({0, attacks.delay}) if model.attacks else []
+    seen = observability(model)
     steady = steady_state(model.A, model.C, model.Q, model.R)
     over = None
     if isinstance(plant, LinearPlant) and plant.steps is not None:
@@ -68,11 +73,12 @@ def analysis(
         over = Window(len(models), rows_until_observable(models), undetermined_steps(models))
     return Analysis(
         model,
-        observability(model),
+        seen,
         steady,
         attacks,
         tuple(bounds(model, P0, delay) for delay in delays),
         over,
         fusion(model, steady),
         decoding(model, window, trusted, weight),
+        attackable(model, steady, seen, compromised),
     )

@@ -33,8 +33,8 @@ class Window(Attack):
         return state, jax.tree.map(lambda added: jnp.where(active, added, 0.0), injection)
 
 
-def windowed(plant: Plant, attack: Attack, start: float, stop: float) -> Window:
-    """``attack`` for start <= t < stop in seconds, t the time of the sample injected.
+def active_steps(plant: Plant, start: float, stop: float) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """The first sample k with t >= start and the first with t >= stop, t = k dt in seconds.
 
     Raises `InvalidValue` for a start that is not finite or a stop that is not after it.
     """
@@ -43,4 +43,12 @@ def windowed(plant: Plant, attack: Attack, start: float, stop: float) -> Window:
     if not stop > start:
         raise InvalidValue("stop", stop, f"seconds after start ({start:g})")
     first, last = (jnp.asarray(first_step(plant, t), jnp.int32) for t in (start, stop))
-    return Window(attack, first, last)
+    return first, last
+
+
+def windowed(plant: Plant, attack: Attack, start: float, stop: float) -> Window:
+    """``attack`` for start <= t < stop in seconds, t the time of the sample injected.
+
+    Raises `InvalidValue` as `active_steps`.
+    """
+    return Window(attack, *active_steps(plant, start, stop))

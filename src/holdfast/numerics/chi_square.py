@@ -12,6 +12,7 @@ from scipy.optimize import root_scalar
 from scipy.special import chdtri, hyp0f1, ndtri
 
 NODES = 120
+SLOPE = 0.7
 SKEWNESSES = 129
 BESSEL_STEP = 0.1
 BESSEL_END = 60.0
@@ -20,45 +21,105 @@ BESSEL_END = 60.0
 def weighted_tail(x: float, weights: np.ndarray, dof: np.ndarray) -> float:
     """P(sum_i weights_i chi2_{dof_i} > x), independent terms, weights > 0.
 
-    The inverse Laplace transform of E exp(s Q) / s = exp(-1/2 sum dof_i log(1 - 2 w_i s)) / s
-    along a parabola through its saddle point (Helstrom's contour): the integrand then falls
-    off like a Gaussian, and the trapezoidal rule is good to 1e-9 relative for single terms
-    and better for sums, also where the tail is 1e-12. Imhof's integral is the same along the
-    imaginary axis, where it oscillates.
+    Relative accuracy as `weighted_tails`.
+    """
+    return weighted_tails(x, weights, dof, np.zeros(len(weights)))[0]
+
+
+def weighted_tails(
+    x: float, weights: np.ndarray, dof: np.ndarray, noncentrality: np.ndarray
+) -> tuple[float, float]:
+    """P(Q > x) and P(Q <= x), Q = sum_i weights_i chi'2_{dof_i}(noncentrality_i), weights > 0.
+
+    Independent terms. Also the smaller of the two is good to 1e-12 relative up to some hundred
+    degrees of freedom (and as much non-centrality), to 1e-10 up to a million: rounding alone.
     """
     if x <= 0:
-        return 1.0
-    w, nu = np.asarray(weights, float), np.asarray(dof, float)
-    upper = x > w @ nu
+        return 1.0, 0.0
+    w, nu, shift2 = (np.asarray(a, float) for a in (weights, dof, noncentrality))
+    part = _contour(x, w, nu, shift2)
+    return (part, 1.0 - part) if x > w @ (nu + shift2) else (1.0 + part, -part)
+
+
+def weighted_rise(
+    x: float, weights: np.ndarray, dof: np.ndarray, noncentrality: np.ndarray
+) -> float:
+    """What ``noncentrality`` adds to P(Q > x), to 1e-9 of itself however little it is.
+
+    Q and arguments as in `weighted_tails`. Where two tails would cancel, the difference is
+    taken of their transforms instead.
+    """
+    if x <= 0:
+        return 0.0
+    w, nu, shift2 = (np.asarray(a, float) for a in (weights, dof, noncentrality))
+    before, below = weighted_tails(x, w, nu, np.zeros(len(w)))
+    after, still_below = weighted_tails(x, w, nu, shift2)
+    if after > 1.1 * before:
+        return after - before
+    if still_below < 0.9 * below:
+        return below - still_below
+    return _contour(x, w, nu, np.zeros(len(w)), shift2)
+
+
+def _contour(
+    x: float,
+    w: np.ndarray,
+    nu: np.ndarray,
+    shift2: np.ndarray,
+    added: np.ndarray | None = None,
+) -> float:
+    """The inverse Laplace transform of E exp(s Q) / s, Q = sum_i w_i chi'2_{nu_i}(shift2_i).
+
+    The transform is exp(sum_i shift2_i w_i s / (1 - 2 w_i s) - nu_i/2 log(1 - 2 w_i s)) / s.
+    The path is a hyperbola through the saddle point: there it bends as steepest descent does,
+    and far out it keeps to a slope at which every term decays, which on Helstrom's parabola a
+    heavy term can spoil for a light one. Imhof's integral is the same along the imaginary
+    axis, where it oscillates. Right of the pole at 0 (x above the mean) this is the upper
+    tail, left of it minus the lower one. With ``added`` it is what this much more
+    non-centrality adds to the upper tail, and there is no pole.
+    """
+    saddle, across, bend = _saddle(x, w, nu, shift2)
+
+    def along(u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        up = across * np.sinh(u)
+        root = np.hypot(1.0, 2.0 * bend * up / SLOPE)
+        s = saddle + 2.0 * bend * up**2 / (1.0 + root) + 1j * up
+        ws = np.multiply.outer(s, w)
+        per_shift = ws / (1.0 - 2.0 * ws)
+        exponent = per_shift @ shift2 - 0.5 * np.log1p(-2.0 * ws) @ nu - s * x
+        return exponent, per_shift, s, across * np.cosh(u) * (2.0 * bend * up / root + 1j)
+
+    steps = np.linspace(0.0, 15.0, 76)
+    heights = np.real(along(steps)[0])
+    reach = steps[np.argmax(np.append(heights[:-1] < heights[0] - 40.0, True))]
+    exponent, per_shift, s, ds = along(reach / NODES * np.arange(NODES + 1))
+    terms = np.exp(exponent - heights[0]) / s * ds
+    terms[0] *= 0.5
+    if added is not None:
+        terms = terms * np.expm1(per_shift @ added)
+    return float(reach / NODES / np.pi * np.exp(heights[0]) * np.sum(terms.imag))
+
+
+def _saddle(
+    x: float, w: np.ndarray, nu: np.ndarray, shift2: np.ndarray
+) -> tuple[float, float, float]:
+    """The saddle point of `_contour` on the real axis, and the scale and bend of its path."""
     edge = 1.0 / (2.0 * np.max(w))
 
     def slope(s: float) -> float:
-        return float(np.sum(nu * w / (1.0 - 2.0 * w * s)) - x - 1.0 / s)
+        spread = w / (1.0 - 2.0 * w * s)
+        return float(spread @ nu + (spread**2 / w) @ shift2 - x - 1.0 / s)
 
-    # right of the pole at 0 the integral is the upper tail, left of it minus the lower one
-    low = -(0.5 * np.sum(nu) + 2.0) / x
+    # left of ``low`` no term's share of the slope outweighs its share here
+    low = -(0.5 * np.sum(nu) + 0.125 * np.sum(shift2) + 2.0) / x
+    upper = x > w @ (nu + shift2)
     bracket = (edge * 1e-15, edge * (1 - 1e-15)) if upper else (low, -edge * 1e-15)
     saddle = float(root_scalar(slope, bracket=bracket, xtol=1e-14 * edge).root)
     spread = w / (1.0 - 2.0 * w * saddle)
-    k2 = 2.0 * np.sum(nu * spread**2) + saddle**-2
-    k3 = 8.0 * np.sum(nu * spread**3) - 2.0 * saddle**-3
-    across = 1.0 / np.sqrt(k2)
-    bend = max(k3 / (6.0 * k2**2), 0.05 * across)
-
-    def exponent(t: np.ndarray) -> np.ndarray:
-        s = saddle + bend * t * t + 1j * across * t
-        return -0.5 * np.log1p(-2.0 * np.multiply.outer(s, w)) @ nu - s * x - np.log(s)
-
-    peak = exponent(np.zeros(1))[0].real
-    reach = 8.0
-    while exponent(np.array([reach]))[0].real > peak - 40.0:
-        reach *= 1.3
-    t = reach / NODES * np.arange(1, NODES + 1)
-    # at the saddle left of the pole log(s) carries a phase of pi: exp() makes it the sign
-    terms = np.exp(exponent(t) - peak) * (2.0 * bend * t + 1j * across)
-    centre = np.cos(exponent(np.zeros(1))[0].imag) * across
-    part = reach / NODES / np.pi * np.exp(peak) * (np.sum(terms.imag) + 0.5 * centre)
-    return float(part if upper else 1.0 + part)
+    k2 = float(2.0 * (spread**2 @ nu + 2.0 * (spread**3 / w) @ shift2) + saddle**-2)
+    k3 = float(8.0 * (spread**3 @ nu + 3.0 * (spread**4 / w) @ shift2))
+    # the pole alone would bend the path to the left, where single terms hardly decay
+    return saddle, k2**-0.5, k3 / (6.0 * k2)
 
 
 def weighted_quantile(level: float, weights: np.ndarray, dof: np.ndarray) -> float:

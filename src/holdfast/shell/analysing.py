@@ -15,6 +15,12 @@ from holdfast.analysis.zeros import Zero
 from holdfast.estimators.l1_decoder import L1Decoder
 from holdfast.loop import Scenario
 from holdfast.shell import runtime
+from holdfast.shell.attackable_content import (
+    attackable_content,
+    attackable_how,
+    attackable_table,
+    compromised_outputs,
+)
 from holdfast.shell.calibrating import busy
 from holdfast.shell.decoding_content import (
     decoders_table,
@@ -31,20 +37,24 @@ DECODING = ("l1_decoder", "l1_kalman")
 """Estimators that decode a window of samples."""
 
 
-def analyse(scenario: str, as_json: bool, allow_python: bool) -> None:
-    """Analyse the plant of a scenario; print a table and sentences, or JSON."""
+def analyse(scenario: str, compromised: str | None, as_json: bool, allow_python: bool) -> None:
+    """Analyse the plant of a scenario; print a table and sentences, or JSON.
+
+    ``compromised``: outputs that a stealthy attacker alters, separated by commas; or "all".
+    """
     runtime.configure()
     found = read_scenario(scenario, allow_python=allow_python).scenario
     x0, P0 = _start(found)
+    altered = compromised_outputs(compromised, found.plant.outputs)
     with busy("analysing the plant"):
-        result = analysis(found.plant, x0, P0, **_decoder(found))
-    fused, decoded = _about(found)
+        result = analysis(found.plant, x0, P0, **_decoder(found), compromised=altered)
+    about = _about(found, altered is not None)
     delay = getattr(found.monitor.estimator, "delay", None)
-    sentences = advice(result, delay, fused, decoded)
+    sentences = advice(result, delay, **about)
     if as_json:
         print(json.dumps(content(result, sentences), allow_nan=False, indent=1))
     else:
-        _print(result, sentences, fused, decoded)
+        _print(result, sentences, **about)
 
 
 def _start(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
@@ -59,16 +69,18 @@ def _kind(scenario: Scenario) -> str:
     return type(scenario.monitor.estimator).__module__.rpartition(".")[2]
 
 
-def _about(scenario: Scenario) -> tuple[bool, bool]:
-    """Whether the scenario is about fusion, or about decoding: by its estimator.
+def _about(scenario: Scenario, asked: bool) -> dict[str, bool]:
+    """Whether the scenario is about fusion, decoding or stealth: by its estimator.
 
-    Of other estimators, where the plant has no attack channels, it may be about either.
+    Of other estimators, where the plant has no attack channels, it may be about any of them;
+    and about stealth where that was ``asked`` for.
     """
-    kind, open_to_both = _kind(scenario), not scenario.plant.attacks
-    return (
-        kind in FUSING or (open_to_both and kind not in DECODING),
-        kind in DECODING or (open_to_both and kind not in FUSING),
-    )
+    kind, open_to_all = _kind(scenario), not scenario.plant.attacks
+    return {
+        "fusion": kind in FUSING or (open_to_all and kind not in DECODING),
+        "decoding": kind in DECODING or (open_to_all and kind not in FUSING),
+        "stealth": asked or (open_to_all and kind not in FUSING + DECODING),
+    }
 
 
 def _decoder(scenario: Scenario) -> dict[str, Any]:
@@ -103,6 +115,8 @@ def content(found: Analysis, sentences: list[str]) -> dict[str, Any]:
         "window": None if window is None else window._asdict(),
         "correctable": decoding_content(found.decoding, found.model.states),
         "fusion": _fusion(found.fusion),
+        "attackable": attackable_content(found),
+        "attackable_how": attackable_how(found),
         "of": found.model.note or None,
         "advice": sentences,
     }
@@ -177,7 +191,9 @@ def _pair(value: complex) -> list[float]:
     return [value.real + 0.0, value.imag + 0.0]
 
 
-def _print(found: Analysis, sentences: list[str], fused: bool, decoded: bool) -> None:
+def _print(
+    found: Analysis, sentences: list[str], fusion: bool, decoding: bool, stealth: bool
+) -> None:
     console = rich.console.Console()
     table = rich.table.Table(show_header=False, box=None, pad_edge=False)
     for name, text in _rows(found):
@@ -185,10 +201,12 @@ def _print(found: Analysis, sentences: list[str], fused: bool, decoded: bool) ->
     console.print(table)
     if found.attacks.channels:
         console.print(_channels(found))
-    if fused and found.fusion.sensors:
+    if fusion and found.fusion.sensors:
         console.print(_liars(found.fusion))
-    if decoded and found.decoding.correctable.reason is None:
+    if decoding and found.decoding.correctable.reason is None:
         console.print(decoders_table(found.decoding.correctable))
+    if stealth and found.attackable.reason is None:
+        console.print(attackable_table(found.attackable))
     for sentence in sentences:
         console.print(f"- {sentence}", markup=False, highlight=False, soft_wrap=True)
 

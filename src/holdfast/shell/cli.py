@@ -75,6 +75,14 @@ def run(
 @app.command()
 def analyse(
     scenario: ScenarioArgument,
+    compromised: Annotated[
+        str | None,
+        typer.Option(
+            "--compromised",
+            help="Outputs that a stealthy attacker alters: A,B or all.",
+            show_default=False,
+        ),
+    ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="JSON to standard output, and nothing else.")
     ] = False,
@@ -83,7 +91,7 @@ def analyse(
     """Say what can be said before any data: observability, attacks, sensors to add."""
     from holdfast.shell import analysing
 
-    analysing.analyse(scenario, as_json, allow_python)
+    analysing.analyse(scenario, compromised, as_json, allow_python)
 
 
 @app.command()

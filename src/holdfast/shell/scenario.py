@@ -6,7 +6,7 @@ import re
 import sys
 import tomllib
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from holdfast.catalog import ATTACKS, CONTROLLERS, DETECTORS, ESTIMATORS, PLANTS
 from holdfast.loop import Monitor, Scenario
 from holdfast.parts import Detector, Estimator, InvalidValue, Plant
 from holdfast.plants.build import covariance
+from holdfast.shell.enforcing import enforcement_of
 from holdfast.shell.errors import InputError, shown
 from holdfast.shell.reading import SCENARIO_LIMIT, STANDARD_INPUT, decode, read_bytes
 from holdfast.shell.schema import (
@@ -95,12 +96,17 @@ def _build(
     if sections.controller is not None:
         table = Table(path, "controller", sections.controller, folder)
         controller = _part(table, CONTROLLERS, plant)
+    enforcement = None
+    if sections.enforcement is not None:
+        table = Table(path, "enforcement", sections.enforcement, folder)
+        enforcement = enforcement_of(table, plant)
+    shared = {"enforcement": enforcement}
     attacks = tuple(
-        _part(Table(path, f"attack[{i}]", values, folder), ATTACKS, plant)
+        _part(Table(path, f"attack[{i}]", values, folder), ATTACKS, plant, shared=shared)
         for i, values in enumerate(sections.attack, 1)
     )
     monitor = Monitor(estimator, detector)
-    scenario = Scenario(plant, jnp.asarray(start), monitor, controller, attacks)
+    scenario = Scenario(plant, jnp.asarray(start), monitor, controller, attacks, enforcement)
     return ScenarioFile(path, source, scenario, run, threshold, calibrate)
 
 
@@ -141,13 +147,19 @@ def _imported(table: Table, target: str) -> Callable[..., Any]:
     return found
 
 
-def _part(table: Table, catalog: dict[str, Callable[..., Any]], plant: Plant, skip=()) -> Any:
+def _part(
+    table: Table,
+    catalog: dict[str, Callable[..., Any]],
+    plant: Plant,
+    skip: Sequence[str] = (),
+    shared: dict[str, Any] | None = None,
+) -> Any:
     kind = table.kind(list(catalog))
     build = catalog[kind]
     wanted = plant_type(build)
     if wanted is not None and not isinstance(plant, wanted):
         raise table.error("kind", f"{kind!r}", f"one that works with a {type(plant).__name__}")
-    return table.built(build, plant, skip=skip)
+    return table.built(build, plant, skip=skip, shared=shared)
 
 
 def _estimator(table: Table, plant: Plant) -> Estimator:

@@ -18,13 +18,17 @@ from holdfast.shell.matrices import matrix
 
 ARRAYS = ("x0", "P0")
 """Parameters that are arrays whatever they are annotated with."""
+FROM_SCENARIO = ("enforcement",)
+"""Keyword parameters of a part that the scenario as a whole gives, not the part's own table."""
 
 
-class _Strict(BaseModel):
+class Strict(BaseModel):
+    """A table whose keys are all known and whose values have the type stated."""
+
     model_config = ConfigDict(extra="forbid", strict=True, arbitrary_types_allowed=True)
 
 
-class RunSettings(_Strict):
+class RunSettings(Strict):
     """How long, how often and from which seed a scenario is simulated."""
 
     steps: int = Field(1000, ge=1, le=10**8, description="a whole number from 1 up")
@@ -32,7 +36,7 @@ class RunSettings(_Strict):
     seed: int = Field(0, ge=0, lt=2**63, description="a whole number from 0 up")
 
 
-class ScenarioTables(_Strict):
+class ScenarioTables(Strict):
     """The sections of a scenario file."""
 
     plant: dict[str, Any] = Field(description="a table: [plant]")
@@ -40,16 +44,17 @@ class ScenarioTables(_Strict):
     detector: dict[str, Any] = Field({"kind": "chi_square"}, description="a table: [detector]")
     controller: dict[str, Any] | None = Field(None, description="a table: [controller]")
     attack: list[dict[str, Any]] = Field([], description="tables: [[attack]]")
+    enforcement: dict[str, Any] | None = Field(None, description="a table: [enforcement]")
     run: dict[str, Any] = Field({}, description="a table: [run]")
 
 
-class _ConstraintSet(_Strict):
+class _ConstraintSet(Strict):
     matrix: Any = Field(description="rows of numbers")
     bound: Any = Field(description="one number per row of matrix")
     bound_u: Any = Field(None, description="rows of numbers")
 
 
-class _ConstraintSets(_Strict):
+class _ConstraintSets(Strict):
     state: dict[str, Any] | None = Field(None, description="{ matrix, bound }")
     attack: dict[str, Any] | None = Field(None, description="{ matrix, bound }")
 
@@ -95,9 +100,10 @@ class Table:
         # a misspelt key says more than the missing one that it was meant to be
         problems = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
         name = str(problems[0]["loc"][0])
+        fields = {field.alias or name: field for name, field in model.model_fields.items()}
         if problems[0]["type"] == "extra_forbidden":
-            return self.error(name, "an unknown key", one_of(model.model_fields, name))
-        field = model.model_fields[name]
+            return self.error(name, "an unknown key", one_of(fields, name))
+        field = fields[name]
         expected = field.description or in_words(field.annotation)
         if problems[0]["type"] == "missing":
             return self.error(name, "nothing", expected)
@@ -107,11 +113,18 @@ class Table:
             expected = in_words(field.annotation, value)
         return self.error(name, shown(value), expected)
 
-    def built(self, build: Callable[..., Any], *given: Any, skip: Sequence[str] = ()) -> Any:
+    def built(
+        self,
+        build: Callable[..., Any],
+        *given: Any,
+        skip: Sequence[str] = (),
+        shared: dict[str, Any] | None = None,
+    ) -> Any:
         """``build(*given, **values)``: the values checked against its signature first.
 
         The first ``len(given)`` parameters are ``given``; those in ``skip`` are dropped from
-        the values where the signature lacks them.
+        the values where the signature lacks them. ``shared``: what the scenario gives to those
+        that ask for it (`FROM_SCENARIO`), by name.
         """
         model = model_of(build, len(given))
         for name in skip:
@@ -119,8 +132,10 @@ class Table:
                 self.values.pop(name, None)
         self._read_arrays(model)
         self.checked(model)
+        asked = inspect.signature(build).parameters
+        extra = {name: value for name, value in (shared or {}).items() if name in asked}
         try:
-            return build(*given, **self.values)
+            return build(*given, **self.values, **extra)
         except InvalidValue as error:
             close = did_you_mean(str(error.found).strip("'"), _names_in(error.expected))
             expected = f"{error.expected}; did you mean {close!r}?" if close else error.expected
@@ -159,13 +174,18 @@ class Table:
 
 
 def model_of(build: Callable[..., Any], given: int) -> type[BaseModel]:
-    """A pydantic model of the parameters of ``build`` after the first ``given``."""
+    """A pydantic model of the parameters of ``build`` after the first ``given``.
+
+    Less those that a table cannot set (`FROM_SCENARIO`).
+    """
     hints = typing.get_type_hints(build)
     fields: dict[str, Any] = {}
     open_ended = False
     for parameter in list(inspect.signature(build).parameters.values())[given:]:
         if parameter.kind is inspect.Parameter.VAR_KEYWORD:
             open_ended = True
+            continue
+        if given and parameter.name in FROM_SCENARIO:
             continue
         annotation = hints.get(parameter.name, Any)
         needed = parameter.default is inspect.Parameter.empty

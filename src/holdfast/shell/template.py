@@ -30,6 +30,7 @@ REQUIRED = {
     "sd": 3.0,
     "count": 1,
     "seconds": 2.0,
+    "size": 0.5,
 }
 """Values for keys that have no default."""
 
@@ -75,6 +76,11 @@ EXAMPLES: dict[str, dict[str, Any]] = {
 """What suits a plant better than zeros: where it starts, and what to attack."""
 
 RUN = """\
+# [enforcement]                 # (run only) samples that are authenticated, so never falsified:
+# every = 20                    # of every so many rows
+# for = 1                       # the first so many,
+# first = 20                    # from this row on; [enforcement.sensors.NAME] for one sensor
+
 [run]
 steps = 300
 runs = 1
@@ -107,7 +113,9 @@ def scenario_text(kind: str | None) -> str:
     values: dict[str, Callable[..., dict[str, Any]]] = {
         "detector": lambda _: {"level": 0.01, "on": judged(estimator)},
         "controller": lambda build: _steering(build, plant),
-        "attack": lambda build: _injection(build, plant, example.get("channel")),
+        "attack": lambda build: _injection(
+            build, plant, example.get("channel"), pushes=kinds["attack"] == "covert"
+        ),
     }
     for section, given in values.items():
         if section in kinds:
@@ -146,13 +154,17 @@ def _steering(build: Callable[..., Any], plant: Plant) -> dict[str, Any]:
     return {name: value for name, value in given.items() if name in fields}
 
 
-def _injection(build: Callable[..., Any], plant: Plant, channel: str | None) -> dict[str, Any]:
+def _injection(
+    build: Callable[..., Any], plant: Plant, channel: str | None, pushes: bool
+) -> dict[str, Any]:
     """What an attack needs: where, when, and the keys without default."""
     fields = model_of(build, 1).model_fields
     # what plays back recorded samples cannot hit an attack channel, which carries none
     target = f"sensor:{plant.outputs[0]}"
     if "value" in fields and plant.attacks:
         target = channel or f"channel:{plant.attacks[0]}"
+    if pushes:
+        target = f"actuator:{plant.inputs[0]}"
     needed = {name: REQUIRED[name] for name in fields if name in REQUIRED}
     begin = 100 * plant.dt
     return {"channel": target, "start": begin, "stop": 2 * begin, **needed}

@@ -1,0 +1,130 @@
+"""Multipliers of many limits at once, by the recursion: for stretches too long to be written out.
+
+Any weights of the steps that keep sum_j share_j = 1 with multipliers share_j / b_j give an outer
+ellipsoid; the smallest one along a direction is an optimal design, and its multiplicative
+algorithm needs no more than what the cheapest attack spends on each limit.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from holdfast.numerics.reachability import Moves, Path, backward, cheapest, forward, joined
+
+ROUNDS = 60
+"""Times that the multipliers are improved; the bounds close in like one over it."""
+CLOSE = 1e-7
+LEAST = 1e-12
+
+
+class Long(NamedTuple):
+    """Steps in a row: their moves, the set of each, sum_i w_ji cost_i <= b_j (w m x t (1 + f), the
+    costs of the residuals first), and a factor of the ellipsoid of e_0, None where it is 0.
+    """
+
+    m: Moves
+    index: np.ndarray
+    w: csr_array
+    b: np.ndarray
+    start: np.ndarray | None
+
+
+class Certificate(NamedTuple):
+    """``share`` (m + 1,): of each limit and of the first ellipsoid, summing to 1."""
+
+    share: np.ndarray
+    weights: np.ndarray
+    start: np.ndarray
+
+
+def certificate(of: Long, share: np.ndarray) -> Certificate:
+    """Any shares (m + 1,), made to sum to 1 and to leave out none."""
+    share = np.array(share, float)
+    if of.start is None:
+        share[-1] = 0.0
+    share[:-1] = np.maximum(share[:-1], LEAST)
+    share = share / np.sum(share)
+    each = of.w.T @ (share[:-1] / of.b)
+    steps, n = len(of.index), of.m.F.shape[1]
+    weights = np.column_stack([each[:steps], each[steps:].reshape(steps, -1)])
+    start = np.zeros((n, n)) if of.start is None else of.start / np.sqrt(max(share[-1], LEAST))
+    return Certificate(share, weights, start)
+
+
+def factors(of: Long, held: Certificate) -> np.ndarray:
+    """Factors (t x n x n) of the ellipsoids of every e_k that a certificate gives."""
+    L = forward(of.m, of.index, held.weights, held.start)
+    T = backward(of.m, of.index, held.weights, np.zeros(len(of.index), np.int32))
+    return joined(L, T)
+
+
+class Descended(NamedTuple):
+    """``upper`` >= max |functional e_k| >= ``lower``, which the attack ``path`` reaches."""
+
+    upper: float
+    lower: float
+    held: Certificate
+    path: Path
+
+
+def descended(
+    of: Long,
+    functional: np.ndarray,
+    k: int,
+    share: np.ndarray | None = None,
+    enough: float = 0.0,
+    rounds: int = ROUNDS,
+) -> Descended:
+    """The multipliers that make the ellipsoid of e_k small, functional e_k being what counts.
+
+    share_j <- share_j sqrt(spent_j / b_j), spent_j what the cheapest attack along the longest axis
+    uses of limit j: it never makes that axis longer. Every turn gives an attack, once it has been
+    scaled to use no limit more than whole. From ``share`` on, until the upper bound is ``enough``
+    or the two meet.
+
+    Source: Silvey, Titterington and Torsney (1978); monotone by Yu (2010).
+    """
+    found = _turn(of, functional, k, np.ones(len(of.b) + 1) if share is None else share)
+    last = found
+    for _ in range(rounds - 1):
+        if found.upper <= max(enough, found.lower * (1.0 + CLOSE)):
+            break
+        last = _turn(of, functional, k, _next_share(of, last))
+        high, low = min(found, last, key=_upper), max(found, last, key=_lower)
+        found = Descended(high.upper, low.lower, high.held, low.path)
+    return found
+
+
+def _upper(one: Descended) -> float:
+    return one.upper
+
+
+def _lower(one: Descended) -> float:
+    return one.lower
+
+
+def _turn(of: Long, functional: np.ndarray, k: int, share: np.ndarray) -> Descended:
+    """Both bounds by one set of multipliers."""
+    held = certificate(of, share)
+    L = forward(of.m, of.index[:k], held.weights[:k], held.start)[-1:]
+    T = backward(of.m, of.index, held.weights, np.zeros(len(of.index), np.int32))
+    left, sizes, _ = np.linalg.svd(functional @ joined(L, T[k - 1][None])[0])
+    goal = functional.T @ left[:, 0]
+    path = cheapest(of.m, of.index, held.weights, k, goal, held.start)
+    most = float(np.max(_spent(of, held, path)))
+    scale = 1.0 / np.sqrt(most) if most > 0 else 0.0
+    path = Path(path.e * scale, path.a * scale, path.cost * scale**2, path.first * scale)
+    reached = float(np.linalg.norm(functional @ path.e[k - 1]))
+    return Descended(float(sizes[0]), reached, held, path)
+
+
+def _spent(of: Long, held: Certificate, path: Path) -> np.ndarray:
+    """What an attack uses of every limit, and of the first ellipsoid: 1 is all of it."""
+    costs = np.concatenate([path.cost[:, 0], path.cost[:, 1:].reshape(-1)])
+    start = 0.0 if of.start is None else np.sum(path.first**2) / max(held.share[-1], LEAST)
+    return np.append((of.w @ costs) / of.b, start)
+
+
+def _next_share(of: Long, found: Descended) -> np.ndarray:
+    return found.held.share * np.sqrt(_spent(of, found.held, found.path))

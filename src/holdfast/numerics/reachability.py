@@ -1,0 +1,313 @@
+"""What an attacker can do to an estimate while a quadratic form of the residuals stays bounded.
+
+The shift e of the error of a steady-state filter obeys e_i = A e_{i-1} - K z_i with the shift of
+the innovation z_i = C A e_{i-1} + a_i, where a_i is free on the outputs that the attacker can alter
+at step i and zero on the others. The cost of a move is weight_i z_i' Q^-1 z_i.
+
+Everything is O(steps n^3) and in square-root form: with unstable A the reachable set spans tens of
+orders of magnitude, and a covariance that has lost half its digits is wrong, not imprecise.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from scipy.linalg import cho_solve, solve_triangular
+
+from holdfast.numerics.linalg import SMALL, solve_lower
+
+
+class Moves(NamedTuple):
+    """A step, for each of m sets of outputs that the attacker can alter:
+
+        e_i = F e_{i-1} + B v,   z_i' Q^-1 z_i = |G e_{i-1}|^2 + |v|^2,
+        a_i = back e_{i-1} + push v,
+
+    v whitened and as free as the attacker is; rows and columns that are not there are zero.
+
+    ``ahead`` (f x p x n): whitened residuals that e_{i-1} must be ready to show whatever the
+    attacker does, if there are any. They have costs of their own.
+    """
+
+    F: Float[Array, "m n n"] | np.ndarray
+    B: Float[Array, "m n p"] | np.ndarray
+    G: Float[Array, "m p n"] | np.ndarray
+    back: Float[Array, "m p n"] | np.ndarray
+    push: Float[Array, "m p p"] | np.ndarray
+    ahead: Float[Array, "f p n"] | np.ndarray
+
+
+def moves(A, C, K, Q, alterable, blocks: int = 0) -> Moves:
+    """The step for every row of ``alterable`` (m x p, bool); Q (p x p) is the innovation's.
+
+    ``blocks`` steps in a row may turn out to be authenticated at any time: their residuals
+    C A (A - K C A)^j e are in ``ahead``.
+
+    With U the outputs that are out of reach and E the others, the cheapest residual of the latter
+    is what the honest ones predict, Q_EU Q_UU^-1 r_U with r = C A e; what is added to it costs by
+    Q_EE - Q_EU Q_UU^-1 Q_UE.
+    """
+    told = C @ A
+    n, p = len(A), len(C)
+    found = [
+        np.zeros((len(alterable), *shape)) for shape in ((n, n), (n, p), (p, n), (p, n), (p, p))
+    ]
+    for row, hit in enumerate(np.asarray(alterable, bool)):
+        out, inside = np.flatnonzero(~hit), np.flatnonzero(hit)
+        keep = np.zeros((p, p))
+        keep[out, out] = 1.0
+        spread = Q[np.ix_(inside, inside)]
+        if len(out):
+            lower = np.linalg.cholesky(Q[np.ix_(out, out)])
+            cross = Q[np.ix_(out, inside)]
+            keep[np.ix_(inside, out)] = cho_solve((lower, True), cross).T
+            half = solve_triangular(lower, cross, lower=True)
+            spread = spread - half.T @ half
+            found[2][row, : len(out)] = solve_triangular(lower, told[out], lower=True)
+        push = np.zeros((p, p))
+        push[np.ix_(inside, range(len(inside)))] = np.linalg.cholesky(spread)
+        found[0][row] = A - K @ keep @ told
+        found[1][row] = -K @ push
+        found[3][row] = keep @ told - told
+        found[4][row] = push
+    whole = np.linalg.cholesky(Q)
+    ahead, move = np.zeros((blocks, p, n)), np.eye(n)
+    for j in range(blocks):
+        ahead[j] = solve_triangular(whole, told @ move, lower=True)
+        move = (A - K @ told) @ move
+    return Moves(*found, ahead)
+
+
+def patterns(alterable: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The distinct rows of ``alterable`` (T x p), and which of them each step has (T,)."""
+    rows, index = np.unique(np.asarray(alterable, bool), axis=0, return_inverse=True)
+    return rows, index.reshape(-1).astype(np.int32)
+
+
+def triangle(m: Float[Array, "r n"]) -> Float[Array, "n n"]:
+    """R upper triangular with R'R = m'm, r >= n, by Householder reflections.
+
+    Large rows first keeps it accurate row by row. Unrolled up to `SMALL`, so that a loop over
+    steps is one compiled kernel.
+    """
+    n = m.shape[1]
+    if n > SMALL:
+        return jnp.linalg.qr(m, mode="r")
+    rows = []
+    for j in range(n):
+        column = m[:, j]
+        length = jnp.sqrt(jnp.sum(column * column))
+        turned = column.at[0].add(jnp.where(column[0] < 0, -length, length))
+        size = jnp.sum(turned * turned)
+        share = jnp.sum(turned[:, None] * m, 0) * (2.0 / jnp.where(size > 0, size, 1.0))
+        m = m - turned[:, None] * share[None, :]
+        rows.append(jnp.where(jnp.arange(n) < j, 0.0, m[0]))
+        m = m[1:]
+    return jnp.stack(rows)
+
+
+def _times(a, b):
+    return jnp.sum(a[:, :, None] * b[None], 1) if max(a.shape + b.shape) <= SMALL else a @ b
+
+
+def informed(L: Float[Array, "n n"], G: Float[Array, "r n"]) -> Float[Array, "n n"]:
+    """A factor of (W^-1 + G'G)^-1 with W = L L', which may be singular: L R^-1,
+    R'R = I + (G L)' G L.
+    """
+    n = L.shape[0]
+    R = triangle(jnp.concatenate([_times(G, L), jnp.eye(n)]))
+    return solve_lower(R.T, jnp.ones(n, bool), L.T).T
+
+
+def forward_step(F, B, G, L):
+    """A factor of W at i from one at i - 1: F (W^-1 + G'G)^-1 F' + B B'."""
+    moved = _times(F, informed(L, G))
+    return triangle(jnp.concatenate([moved.T, B.T])).T
+
+
+def backward_step(F, B, G, T):
+    """A factor of the cost to come, S = T'T, at i - 1 from one at i:
+    F' S (I + B B' S)^-1 F + G'G.
+    """
+    n = F.shape[0]
+    R = triangle(jnp.concatenate([_times(T, B).T, jnp.eye(n)]))
+    after = solve_lower(R.T, jnp.ones(n, bool), T)
+    return triangle(jnp.concatenate([_times(after, F), G]))
+
+
+def _step(m: Moves, index, weight):
+    """F, B and all that is told of e, of a step whose costs are multiplied by ``weight``."""
+    root = jnp.sqrt(weight)
+    n = m.F.shape[-1]
+    ready = (m.ahead * root[1:, None, None]).reshape(-1, n)
+    return m.F[index], m.B[index] / root[0], jnp.concatenate([m.G[index] * root[0], ready])
+
+
+def _still(m: Moves) -> Moves:
+    """The same with one more set, of a step at which nothing happens."""
+    n, p = m.F.shape[1], m.B.shape[2]
+    more = (np.eye(n), np.zeros((n, p)), np.zeros((p, n)), np.zeros((p, n)), np.zeros((p, p)))
+    rows = (np.concatenate([x, y[None]]) for x, y in zip(m[:5], more, strict=True))
+    return Moves(*rows, m.ahead)
+
+
+def _padded(m: Moves, index, *rows):
+    """The moves, and everything of length t filled up with still steps to a length that many
+    share: a program for every length would be compiled for every length.
+    """
+    t = len(index)
+    more = max(16, 1 << (t - 1).bit_length()) - t
+    index = np.concatenate([index, np.full(more, m.F.shape[0])]).astype(np.int32)
+    filled = []
+    for row in rows:
+        tail = np.ones if row.ndim == 2 else np.zeros
+        filled.append(np.concatenate([row, tail((more, *row.shape[1:]), row.dtype)]))
+    return _still(m), index, *filled
+
+
+def forward(m: Moves, index, weights, start) -> np.ndarray:
+    """Factors (t x n x n) of W_1 .. W_t: the e_i that cost at most 1 so far are those with
+    e' W_i^+ e <= 1.
+
+    ``index`` (t,): the set of each step. ``weights`` (t x (1 + f)): of each step's residual and,
+    behind it, of what is ``ahead``. ``start`` (n x n): a factor of W_0, zero where the attack
+    starts from nothing.
+    """
+    return np.asarray(_forward(*_padded(m, index, weights), start))[: len(index)]
+
+
+def backward(m: Moves, index, weights, ends) -> np.ndarray:
+    """Factors (t x n x n) of S_1 .. S_t: from e at step i on, a cost of e' S_i e is to come, up to
+    the next step where ``ends`` (t,) is not 0 (S is zero there and at t).
+    """
+    ends = np.array(ends, np.int32)
+    ends[-1] = 1
+    return np.asarray(_backward(*_padded(m, index, weights, ends)))[: len(index)]
+
+
+@jax.jit
+def _forward(
+    m: Moves, index: Int[Array, " t"], weights: Float[Array, "t c"], start: Float[Array, "n n"]
+) -> Float[Array, "t n n"]:
+
+    def one(L, at):
+        L = forward_step(*_step(m, *at), L)
+        return L, L
+
+    return jax.lax.scan(one, start, (index, weights))[1]
+
+
+@jax.jit
+def _backward(
+    m: Moves, index: Int[Array, " t"], weights: Float[Array, "t c"], ends: Int[Array, " t"]
+) -> Float[Array, "t n n"]:
+
+    def one(T, at):
+        *step, end = at
+        T = jnp.where(end != 0, 0.0, T)
+        return backward_step(*_step(m, *step), T), T
+
+    start = jnp.zeros(m.F.shape[1:])
+    return jax.lax.scan(one, start, (index, weights, ends), reverse=True)[1]
+
+
+def joined(L: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """Factors of (W^-1 + S)^-1 for stacks (t x n x n) of factors of W and S."""
+    t, n = L.shape[:2]
+    more = np.zeros((max(16, 1 << (t - 1).bit_length()) - t, n, n))
+    return np.asarray(_joined(*(np.concatenate([x, more]) for x in (L, T))))[:t]
+
+
+@jax.jit
+def _joined(L: Float[Array, "t n n"], T: Float[Array, "t n n"]) -> Float[Array, "t n n"]:
+    return jax.lax.scan(lambda _, at: (None, informed(*at)), None, (L, T))[1]
+
+
+class Path(NamedTuple):
+    """An attack from step 1 to t: the shifts of the error, what is added to each output, and the
+    squares of each step's residual and of what is ahead of it, t x (1 + f); ``first``: the first
+    error in units of its ellipsoid.
+    """
+
+    e: np.ndarray
+    a: np.ndarray
+    cost: np.ndarray
+    first: np.ndarray
+
+
+@jax.jit
+def _climb(m: Moves, index, weights, before, last, costate):
+    """The cheapest way to e_last: costates going back (Bryson and Frazier), with the factors
+    ``before`` of W_0 .. W_{t-1}. Steps after ``last`` are left at zero.
+    """
+
+    def one(costate, at):
+        i, index, weight, L = at
+        F, B, G = _step(m, index, weight)
+        active = i < last
+        moved = jnp.where(active, F.T @ costate, 0.0)
+        push = jnp.where(active, B.T @ costate, 0.0)
+        inside = informed(L, G)
+        e = inside @ (inside.T @ moved)
+        costate = jnp.where(active, moved - G.T @ (G @ e), costate)
+        return costate, (e, push / jnp.sqrt(weight[0]))
+
+    rows = (jnp.arange(len(index)), index, weights, before)
+    return jax.lax.scan(one, costate, rows, reverse=True)
+
+
+@jax.jit
+def _walk(m: Moves, index, weights, after, first, start):
+    """The cheapest way on from e_first, with the factors ``after`` of S_1 .. S_t."""
+
+    def one(e, at):
+        i, index, weight, T = at
+        F, B, _ = _step(m, index, weight)
+        reach, n = _times(T, B), T.shape[0]
+        lower = triangle(jnp.concatenate([reach.T, jnp.eye(n)])).T
+        # -B' S (I + B B' S)^-1 F e by the factor of I + T B B' T'
+        half = solve_lower(lower, jnp.ones(n, bool), T @ (F @ e))
+        whole = jax.scipy.linalg.solve_triangular(lower.T, half)
+        push = jnp.where(i >= first, -reach.T @ whole, 0.0)
+        after = jnp.where(i >= first, F @ e + B @ push, e)
+        return after, (e, push / jnp.sqrt(weight[0]))
+
+    return jax.lax.scan(one, start, (jnp.arange(len(index)), index, weights, after))[1]
+
+
+def cheapest(m: Moves, index, weights, k: int, goal, start) -> Path:
+    """Of all attacks over t steps with e_k = Y goal the one of least total weighted cost.
+
+    ``goal`` (n,) is a direction of interest: Y goal is where the ellipsoid of Y (the e_k that cost
+    at most 1 from the start to t) reaches furthest along it. ``start``: as in `forward`.
+    """
+    L = np.concatenate([start[None], forward(m, index, weights, start)])
+    T = backward(m, index, weights, np.zeros(len(index), np.int32))
+    shape = joined(L[k][None], T[k - 1][None])[0]
+    top = shape @ (shape.T @ goal)
+    # the costate before the cost to come: W costate = Y goal
+    costate = goal - T[k - 1].T @ (T[k - 1] @ top)
+    filled = _padded(m, index, weights)
+    more = np.zeros((len(filled[1]) - len(index), *T.shape[1:]))
+    left, back = _climb(*filled, np.concatenate([L[:-1], more]), k, costate)
+    on = _walk(*filled, np.concatenate([T, more]), k, top)
+    past = (np.arange(len(index)) < k)[:, None]
+    e, v = (
+        np.where(past, np.asarray(x)[: len(index)], np.asarray(y)[: len(index)])
+        for x, y in zip(back, on, strict=True)
+    )
+    return travelled(m, index, e, v, start.T @ np.asarray(left))
+
+
+def travelled(m: Moves, index, before: np.ndarray, v: np.ndarray, first: np.ndarray) -> Path:
+    """The path whose errors before each step are ``before`` (t x n) and moves ``v`` (t x p)."""
+
+    def of(matrices, vectors):
+        return np.einsum("tij,tj->ti", np.asarray(matrices)[index], vectors)
+
+    own = np.sum(of(m.G, before) ** 2, 1) + np.sum(v**2, 1)
+    ahead = np.sum(np.einsum("fpn,tn->tfp", m.ahead, before) ** 2, 2)
+    cost = np.column_stack([own, ahead])
+    return Path(of(m.F, before) + of(m.B, v), of(m.back, before) + of(m.push, v), cost, first)

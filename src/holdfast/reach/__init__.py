@@ -1,0 +1,1 @@
+"""What a stealthy attacker can reach, and policies of authentication that bound it."""

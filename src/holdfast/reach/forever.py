@@ -1,0 +1,197 @@
+"""Bounds that hold at every step of a periodic policy, however long the attack lasts."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from holdfast.numerics.attack_sets import MOST
+from holdfast.numerics.attackable import growth
+from holdfast.numerics.multipliers import Certificate, Long, certificate, descended
+from holdfast.numerics.reachability import forward
+from holdfast.reach.pieces import Highest, Piece, highest, sizes_of, stretch, unknowns
+from holdfast.reach.setting import Setting
+
+LONGEST = 2000
+"""Steps of a period that is looked at."""
+TURNS = 400
+"""Periods after which a set that still grows is given up."""
+MARGIN = 1.0 + 1e-6
+"""Growth over a period that counts as none, and that the set is enlarged by for it."""
+ROUGH = 1e-3
+"""Relative change of a set's size that is not worth another round."""
+FEW = 12
+"""Turns of the multipliers where only a choice hangs on them."""
+PARTS = np.geomspace(1e-3, 0.3, 8)
+"""What a step may take of a certificate, tried one after the other."""
+ROUNDS = 6
+"""Times that the multipliers and the set that they keep are chosen in turn."""
+
+
+class Forever(NamedTuple):
+    """``bounded``: whether the error stays bounded for ever, decided by ``radius``, the largest
+    modulus per step of what can be moved unseen (under 1: bounded); None where the period is too
+    long to look at.
+
+    ``kept``: a factor of an ellipsoid that holds e_after and every e a whole number of periods
+    later; None where there is none, ``reason`` says why.
+    """
+
+    period: int
+    radius: float
+    bounded: bool | None
+    after: int
+    kept: np.ndarray | None
+    reason: str | None
+
+
+def forever(setting: Setting) -> Forever:
+    """The periodic steady state: a set that a period maps into itself, and what follows from it.
+
+    The set is the fixed point of the period map of the recursion with multipliers that fade from
+    period to period: W <- Y(W / mu_0; mu_1 .. mu_L), sum mu_j b_j = 1. What the map of a period
+    sends into itself holds the error for ever, once it holds it at one step.
+    """
+    period = _period(setting)
+    if period > LONGEST:
+        return _none(setting, period, math.nan, None, f"the period of {period} steps is too long")
+    s = setting.system
+    found = growth(s.A, s.C, s.K, setting.alterable(period, _start(setting)), aware=setting.aware)
+    if found.unbounded:
+        why = f"a mode of modulus {found.radius:.6g} can be moved unseen"
+        return _none(setting, period, found.radius, False, why)
+    if setting.stealth.detector == "sprt":
+        why = "the bound of a sum of residuals grows with its length"
+        return _none(setting, period, found.radius, True, why)
+    kept = _kept(setting, period)
+    if kept is None:
+        return _none(setting, period, found.radius, True, "no set was found that a period keeps")
+    return Forever(period, found.radius, True, _start(setting), kept, None)
+
+
+def _none(setting, period, radius, bounded, reason) -> Forever:
+    return Forever(period, radius, bounded, _start(setting), None, reason)
+
+
+def _period(setting: Setting) -> int:
+    """The least common multiple of the periods of the outputs that are attacked."""
+    if setting.enforcement is None:
+        return 1
+    every, duration, _ = setting.enforcement_fields
+    held = setting.compromised & (duration > 0)
+    return math.lcm(1, *(int(e) for e in every[held]))
+
+
+def _start(setting: Setting) -> int:
+    """A step from which on the policy is periodic: the end of the first blocks of all."""
+    if setting.enforcement is None:
+        return 0
+    _, duration, first = setting.enforcement_fields
+    held = setting.compromised & (duration > 0)
+    return int(np.max((first + duration - 1)[held], initial=0))
+
+
+def _kept(setting: Setting, period: int) -> np.ndarray | None:
+    """A factor of a set that holds e at `_start` and that a period maps into itself.
+
+    First with multipliers that fade evenly, then with those that suit the worst step of the
+    period, chosen in turn with the set. Every one of them is sound; the best is taken.
+    """
+    after, n = _start(setting), len(setting.system.A)
+    of = stretch(setting, Piece(after, after + period, np.eye(n)))
+    best, least = None, math.inf
+    for part in PARTS:
+        kept = _fixed(of, certificate(of, _fading(len(of.b), part, period)))
+        if kept is not None and (size := _largest(setting, of, kept)[0]) < least:
+            best, least = kept, size
+    for _ in range(ROUNDS if best is not None else 0):
+        kept = _fixed(of, _suited(setting, of, best))
+        if kept is None or (size := _largest(setting, of, kept)[0]) >= least * (1.0 - ROUGH):
+            break
+        best, least = kept, size
+    return None if best is None else best * _held(setting, best)
+
+
+def _fading(count: int, part: float, period: int) -> np.ndarray:
+    """Shares of ``count`` limits and of what came before: each step takes ``part`` of the rest."""
+    fade = part * (1.0 - part) ** np.arange(period)[::-1]
+    groups = max(1, count // period)
+    return np.append(np.resize(fade, count) / groups, (1.0 - part) ** period)
+
+
+def _fixed(of: Long, held: Certificate) -> np.ndarray | None:
+    """The set that the period map with this certificate keeps, from below; None if it grows on."""
+    W = np.zeros_like(held.start)
+    fade = float(held.share[-1])
+    for _ in range(TURNS):
+        new = forward(of.m, of.index, held.weights, W / np.sqrt(fade))[-1]
+        if not np.all(np.isfinite(new)):
+            return None
+        # if W goes into MARGIN^2 W, then MARGIN^2 W goes into itself: the map of t W is at most
+        # t times that of W for t >= 1
+        if _ratio(new, W) <= MARGIN:
+            return W * MARGIN
+        W = new
+    return None
+
+
+def _ratio(inner: np.ndarray, outer: np.ndarray) -> float:
+    """The least t with inner inner' <= t^2 outer outer', inf where there is none."""
+    found, *_ = np.linalg.lstsq(outer, inner, rcond=1e-13)
+    left = np.linalg.norm(outer @ found - inner)
+    return np.inf if left > 1e-9 * np.linalg.norm(inner) else float(np.linalg.norm(found, 2))
+
+
+def _largest(setting: Setting, of: Long, kept: np.ndarray) -> tuple[float, int]:
+    """The largest error within a period that starts in the set, roughly, and its step."""
+    of = of._replace(start=kept)
+    sizes = sizes_of(setting, of, certificate(of, np.ones(len(of.b) + 1)))
+    place = int(np.argmax(sizes)) + 1
+    return descended(of, setting.functional, place, rounds=FEW).upper, place
+
+
+def _suited(setting: Setting, of: Long, kept: np.ndarray) -> Certificate:
+    """The certificate of the period map that serves the worst step best, given the set.
+
+    What matters of the error after a period is what becomes of it at that step of the next one;
+    a little of the rest keeps the set from growing where that does not look.
+    """
+    of = of._replace(start=kept)
+    _, place = _largest(setting, of, kept)
+    grown = np.eye(len(kept))
+    for which in of.index[:place]:
+        grown = np.asarray(of.m.F)[which] @ grown
+    on = setting.functional @ grown
+    weak = 1e-3 * np.linalg.norm(on, 2) * np.eye(len(kept))
+    return descended(of, np.vstack([on, weak]), len(of.index), rounds=FEW).held
+
+
+def _held(setting: Setting, kept: np.ndarray) -> float:
+    """What the set has to be multiplied by to hold every e at `_start`; at least 1."""
+    after = _start(setting)
+    if after == 0:
+        return 1.0
+    of = stretch(setting, Piece(0, after, None))
+    if unknowns(of) == 0:
+        return 1.0
+    return max(1.0, descended(of, np.linalg.pinv(kept), after).upper)
+
+
+def worst(setting: Setting, found: Forever, limit: float = math.inf) -> Highest | None:
+    """The largest error at any step ever, from above; None where no set is kept.
+
+    Over the first steps from the start itself; from then on over a period that as many whole
+    periods lie before as can be written out, from the set that all of them keep. Over ``limit``
+    the first bound that is will do.
+    """
+    if found.kept is None:
+        return None
+    width = max(1, int(np.sum(setting.compromised)))
+    before = max(0, MOST // width // found.period - 1) * found.period
+    early = found.after + before
+    last = early + found.period
+    piece = Piece(found.after, last, found.kept)
+    top = highest(setting, piece, range(early + 1, last + 1), limit)
+    if early and top.value <= limit:
+        top = max(top, highest(setting, Piece(0, early, None), range(1, early + 1), limit))
+    return top

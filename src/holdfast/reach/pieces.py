@@ -1,0 +1,120 @@
+"""Stretches of steps, and what is certified of the errors in them."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from holdfast.numerics.attack_sets import MOST, attacks
+from holdfast.numerics.multipliers import Certificate, Long, certificate, descended, factors
+from holdfast.numerics.quadratic_reach import largest
+from holdfast.reach.setting import Setting
+
+SHOWN = 15
+"""Turns after which a bound of its own is computed for a step."""
+SLACK = 1e-4
+"""What the largest of several bounds may be above the largest one computed to the end."""
+
+
+class Piece(NamedTuple):
+    """The steps first + 1 .. last, from an ellipsoid with the factor ``start`` that holds
+    e_first; without it e_first is 0.
+    """
+
+    first: int
+    last: int
+    start: np.ndarray | None
+
+
+class Bounds(NamedTuple):
+    """``upper`` >= the largest |functional e_k| >= ``lower``, and what proves the upper one."""
+
+    upper: float
+    lower: float
+    held: Certificate
+
+
+def stretch(setting: Setting, piece: Piece, tight: bool = False) -> Long:
+    """The attacks over a piece, within what the detector allows."""
+    m, index = setting.moves(piece.last - piece.first, piece.first)
+    limits = setting.stealth.limits(piece.last, piece.first, setting.blocks, tight)
+    return Long(m, index, limits.w, limits.b, piece.start)
+
+
+def small(of: Long) -> bool:
+    """Whether the attacks can be written out and their cone programs solved exactly."""
+    return of.start is None and unknowns(of) <= MOST
+
+
+def unknowns(of: Long) -> int:
+    """How many numbers the attacker chooses."""
+    free = np.sum(np.any(np.asarray(of.m.push) != 0, axis=1), axis=1)
+    return int(np.sum(free[of.index]))
+
+
+def bounds(
+    setting: Setting, piece: Piece, of: Long, k: int, share: np.ndarray | None = None
+) -> Bounds | None:
+    """Both bounds at k; None where no attack moves it at all. ``share``: multipliers to begin at.
+
+    From below by an attack that begins with the piece: where the piece starts in an ellipsoid
+    nobody says that its far ends can be reached.
+    """
+    place, functional = k - piece.first, setting.functional
+    if not small(of):
+        if of.start is None and unknowns(of) == 0:
+            return None
+        above = descended(of, functional, place, share)
+        if of.start is None:
+            return Bounds(above.upper, above.lower, above.held)
+        below = descended(of._replace(start=None), functional, place)
+        return Bounds(above.upper, below.lower, above.held)
+    found = attacks(of)
+    B = functional @ found.errors[place - 1]
+    if not np.any(B):
+        return None
+    both = largest(found.Z, found.w, found.b, B)
+    return Bounds(both.upper, both.lower, certificate(of, np.append(both.mu * of.b, 0.0)))
+
+
+class Highest(NamedTuple):
+    """The largest upper bound over some steps, and the step it is of."""
+
+    value: float
+    k: int
+
+
+def highest(
+    setting: Setting, piece: Piece, steps: range, limit: float = np.inf, tight: bool = False
+) -> Highest:
+    """The largest of the upper bounds at ``steps``, without computing all of them.
+
+    Once one is known, of every other step it only has to be shown that its bound is no larger, or
+    larger by `SLACK` at most; what has been found for its neighbours is where that begins. Over
+    ``limit`` the first bound that is will do.
+    """
+    of = stretch(setting, piece, tight)
+    share = np.ones(len(of.b) + 1)
+    places = np.array(steps) - piece.first - 1
+    rough = sizes_of(setting, of, certificate(of, share))[places]
+    value, top = 0.0, steps[0]
+    for i in np.argsort(-rough):
+        if rough[i] <= value:
+            continue
+        enough = value * (1.0 + SLACK)
+        shown = descended(of, setting.functional, int(places[i]) + 1, share, enough, SHOWN)
+        rough = np.minimum(rough, sizes_of(setting, of, shown.held)[places])
+        share = shown.held.share
+        if shown.upper <= enough:
+            value = max(value, shown.upper)
+            continue
+        own = bounds(setting, piece, of, steps[i], share)
+        if own is not None and own.upper > value:
+            value, top = own.upper, steps[i]
+        if value > limit:
+            break
+    return Highest(value, top)
+
+
+def sizes_of(setting: Setting, of: Long, held: Certificate) -> np.ndarray:
+    """What one certificate says of every step."""
+    return np.linalg.norm(setting.functional @ factors(of, held), 2, axis=(1, 2))
