@@ -16,6 +16,7 @@ from holdfast.attacks import (
     ramp,
     replay,
     sine,
+    stealthy,
     zero_dynamics,
 )
 from holdfast.controllers import feedback, pole_placement
@@ -95,6 +96,7 @@ ATTACKS: Builders = {
     "delay": delay.build,
     "freeze": freeze.build,
     "covert": covert.build,
+    "stealthy": stealthy.build,
     "zero_dynamics": zero_dynamics.build,
 }
 

@@ -101,8 +101,14 @@ def check(A, C, K, can):
     if found.radius < 1.01:
         # otherwise the rounding of what grows is soon larger than what does not
         rest = np.eye(len(A)) - S @ S.T
-        sizes = [np.linalg.norm(rest @ reached(A, C, K, can, T) @ rest, 2) for T in (384, 768)]
-        assert sizes[1] <= 1.01 * sizes[0] + 1e-9, found
+
+        def settled(steps):
+            sizes = (reached(A, C, K, can, T) for T in (steps, 2 * steps))
+            before, after = (np.linalg.norm(rest @ W @ rest, 2) for W in sizes)
+            return after <= 1.01 * before + 1e-9
+
+        # what is hardly seen settles late
+        assert settled(384) or settled(4096), found
     return found
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.special import chdtr, chdtrc, chdtri
+from scipy.special import chdtr, chdtrc, chdtri, ndtr
 from scipy.stats import ncx2
 
 from holdfast.numerics.chi_square import weighted_rise, weighted_tail, weighted_tails
@@ -86,7 +86,7 @@ def test_alpha_over_a_larger_grid(dof, epsilon):
 
 @pytest.mark.parametrize(
     ("shift", "dof", "threshold"),
-    [(1, 1, 1400), (0.01, 1, 1300), (30, 3, 2000), (995, 1, 1e6), (5, 1e3, 3e3), (80, 1e6, 1.05e6)],
+    [(1, 1, 1400), (0.01, 1, 1300), (30, 3, 2000), (5, 1e3, 3e3), (80, 1e6, 1.05e6)],
 )
 def test_a_tail_as_small_as_1e_300_keeps_its_digits(shift, dof, threshold):
     truth, _ = poisson_series(shift, dof, threshold)
@@ -101,6 +101,15 @@ def test_a_tail_as_small_as_1e_300_keeps_its_digits(shift, dof, threshold):
 def test_excess_far_beyond_the_threshold_and_next_to_nothing(shift, dof, threshold):
     truth, _ = poisson_series(shift, dof, threshold)
     assert abs(float(mp.mpf(excess(shift**2, dof, threshold)) / truth - 1)) < 1e-12
+
+
+@pytest.mark.parametrize("threshold", [1e-4, 1.0, 30.0, 1e6])
+@pytest.mark.parametrize("beyond", [-5.0, 0.0, 4.0])
+def test_one_degree_of_freedom_is_a_normal_variable(threshold, beyond):
+    root = np.sqrt(threshold)
+    shift = abs(root + beyond)
+    truth = ndtr(shift - root) + ndtr(-shift - root)
+    assert tail(shift**2, 1, threshold) == pytest.approx(truth, rel=2e-12)
 
 
 def test_tails_agree_with_scipy():
@@ -135,6 +144,14 @@ def test_the_bound_next_to_what_there_is():
     shift = alpha_chi2(room * (1 - 1e-9), 2, 9.0)
     assert 7.0 < shift < 9.0 + 6.0
     assert ncx2.cdf(9.0, 2, shift**2) == pytest.approx(1e-9 * room, rel=1e-5)
+
+
+def test_a_threshold_that_noise_never_reaches():
+    """A false alarm rate that is 0 in any float: the shift alone decides."""
+    for dof, threshold in ((3, 2000.0), (1e4, 5e4)):
+        shift = alpha_chi2(0.3, dof, threshold)
+        truth, slope = poisson_series(shift, dof, threshold)
+        assert abs(float((truth - mp.mpf(0.3)) / (shift * slope))) < 1e-10
 
 
 def test_a_sequence_is_solved_entry_by_entry():
@@ -202,7 +219,7 @@ def test_other_arguments_without_an_answer():
         excess(-1.0, 2, 3.0)
     with pytest.raises(ValueError, match="at least 0"):
         weighted_noncentral_tail(1.0, [1.0, -1.0], 1.0, 0.0)
-    with pytest.raises(ValueError, match="can rise"):
+    with pytest.raises(ValueError, match="probability rises"):
         largest_shift(0.5, [1.0, 1.0], 1.0, 1.0, 0)  # P(chi2_2 <= 1) = 0.39
     with pytest.raises(ValueError, match="threshold"):
         largest_shift(0.5, [1.0, 1.0], 1.0, 0.0, 0)

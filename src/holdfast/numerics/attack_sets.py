@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
-from holdfast.numerics.multipliers import Long
+from holdfast.numerics.multipliers import Long, descended
+from holdfast.numerics.quadratic_reach import largest
 from holdfast.numerics.reachability import Path, travelled
 
 MOST = 120
@@ -84,3 +85,12 @@ def path(of: Long, found: Attacks, theta: np.ndarray) -> Path:
     n = found.errors.shape[1]
     before = np.concatenate([np.zeros((1, n)), found.errors[:-1] @ theta])
     return travelled(of.m, of.index, before, v, np.zeros(n))
+
+
+def strongest(of: Long, functional: np.ndarray, k: int) -> Path:
+    """The attack from e_0 = 0 that makes |functional e_k| as large as was found, within limits."""
+    free = np.any(np.asarray(of.m.push) != 0, axis=1).sum(1)
+    if np.sum(free[of.index]) > MOST:
+        return descended(of, functional, k).path
+    found = attacks(of)
+    return path(of, found, largest(found.Z, found.w, found.b, functional @ found.errors[k - 1]).theta)

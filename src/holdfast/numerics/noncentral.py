@@ -147,9 +147,8 @@ def excess(noncentrality: float, dof: float, threshold: float) -> float:
     """
     if not 0 <= noncentrality < np.inf:
         raise ValueError(f"a non-centrality is finite and at least 0, not {noncentrality}")
-    nu, x = np.array([dof], float), np.array([threshold], float)
+    shift, nu, x = (np.array([v], float) for v in (np.sqrt(noncentrality), dof, threshold))
     _check(nu, x)
-    shift = np.array([noncentrality], float) ** 0.5
     return float(np.exp(_log_excess(shift, nu, x)[0][0])) if noncentrality > 0 else 0.0
 
 
@@ -172,10 +171,8 @@ def _check(dof: np.ndarray, threshold: np.ndarray) -> None:
 
 def _check_rise(epsilon: float, room: float) -> None:
     if not 0 < epsilon < room:
-        raise ValueError(
-            f"an alarm probability can rise by more than 0 and by less than what it leaves, "
-            f"{room:.6g}, not by {epsilon}"
-        )
+        most = f"less than what it leaves, {room:.6g}"
+        raise ValueError(f"an alarm probability rises by more than 0 and {most}, not by {epsilon}")
 
 
 def _solve(
@@ -188,7 +185,8 @@ def _solve(
     if start is None:
         # the normal approximation where it gives a shift, else the slope at 0
         rise = x - dof + 2 * z * (z + np.sqrt(np.maximum(z * z + 0.5 * dof + x - dof, 0.0)))
-        small = 2.0 * epsilon * np.exp(-_log_rate(np.zeros(len(x)), 0.5 * dof, 0.5 * x))
+        flat = -_log_rate(np.zeros(len(x)), 0.5 * dof, 0.5 * x)
+        small = 2.0 * epsilon * np.exp(np.minimum(flat, 600.0))
         start = np.sqrt(np.where(rise > 0, np.minimum(rise, small), small))
     v = np.minimum(start, high)
     todo = np.arange(len(x))
