@@ -221,7 +221,6 @@ def test_a_gain_that_does_not_stabilise_leaves_modes_alone():
     assert found.radius == pytest.approx(1.1)
     np.testing.assert_array_equal(found.subspace, [[1.0], [0.0]])
     assert not growth(A, np.eye(2), np.zeros((2, 2)), can).unbounded
-    # at other steps another sensor moves another mode of the two
     turns = np.array([[True, False], [False, True]])
     assert growth(A, np.eye(2), np.diag([0.5, 0.0]), turns).unbounded is False
     # a gain that couples them, in general coordinates: mode 1.2 cannot be reached

@@ -364,10 +364,9 @@ def test_the_bounds_never_pass_each_other(seed, kind, q, r):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(2))
-def test_twenty_thousand_directions(seed):
+def test_twenty_thousand_directions():
     """The support function of the image at every direction, by the solver with one row."""
-    Z, w, b, B = drawn(seed, KINDS[seed], 2, d=3, r=1)
+    Z, w, b, B = drawn(1, "windows", 2, d=3, r=1)
     found = largest(Z, w, b, B)
     angle = np.linspace(0, np.pi, 20_000, endpoint=False)
     ends = [outer(Z, w, b, np.array([[np.cos(a), np.sin(a)]]) @ B).theta[:, 0] for a in angle]

@@ -74,7 +74,9 @@ def build(
     """
     found = resolve(plant, channel, channels)
     if bool(np.any(found.u)) or bool(np.any(found.d)):
-        raise InvalidValue("channels", channels or [channel], "sensors: a stealthy attack is on them")
+        raise InvalidValue(
+            "channels", channels or [channel], "sensors: a stealthy attack is on them"
+        )
     number("epsilon", epsilon)
     if not 0.0 < epsilon < 1.0 - level:
         raise InvalidValue("epsilon", epsilon, f"between 0 and 1 - level ({1.0 - level:g})")

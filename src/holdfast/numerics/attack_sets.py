@@ -93,4 +93,6 @@ def strongest(of: Long, functional: np.ndarray, k: int) -> Path:
     if np.sum(free[of.index]) > MOST:
         return descended(of, functional, k).path
     found = attacks(of)
-    return path(of, found, largest(found.Z, found.w, found.b, functional @ found.errors[k - 1]).theta)
+    return path(
+        of, found, largest(found.Z, found.w, found.b, functional @ found.errors[k - 1]).theta
+    )

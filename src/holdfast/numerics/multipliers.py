@@ -40,15 +40,14 @@ class Certificate(NamedTuple):
 
 def certificate(of: Long, share: np.ndarray) -> Certificate:
     """Any shares (m + 1,), made to sum to 1 and to leave out none."""
-    share = np.array(share, float)
+    share = np.maximum(np.asarray(share, float), LEAST)
     if of.start is None:
         share[-1] = 0.0
-    share[:-1] = np.maximum(share[:-1], LEAST)
     share = share / np.sum(share)
     each = of.w.T @ (share[:-1] / of.b)
     steps, n = len(of.index), of.m.F.shape[1]
     weights = np.column_stack([each[:steps], each[steps:].reshape(steps, -1)])
-    start = np.zeros((n, n)) if of.start is None else of.start / np.sqrt(max(share[-1], LEAST))
+    start = np.zeros((n, n)) if of.start is None else of.start / np.sqrt(share[-1])
     return Certificate(share, weights, start)
 
 
@@ -122,7 +121,7 @@ def _turn(of: Long, functional: np.ndarray, k: int, share: np.ndarray) -> Descen
 def _spent(of: Long, held: Certificate, path: Path) -> np.ndarray:
     """What an attack uses of every limit, and of the first ellipsoid: 1 is all of it."""
     costs = np.concatenate([path.cost[:, 0], path.cost[:, 1:].reshape(-1)])
-    start = 0.0 if of.start is None else np.sum(path.first**2) / max(held.share[-1], LEAST)
+    start = 0.0 if of.start is None else np.sum(path.first**2) / held.share[-1]
     return np.append((of.w @ costs) / of.b, start)
 
 

@@ -250,7 +250,7 @@ def _climb(m: Moves, index, weights, before, last, costate):
         moved = jnp.where(active, F.T @ costate, 0.0)
         push = jnp.where(active, B.T @ costate, 0.0)
         inside = informed(L, G)
-        e = inside @ (inside.T @ moved)
+        e = inside @ (inside.T @ moved)  # 0 with them where not active
         costate = jnp.where(active, moved - G.T @ (G @ e), costate)
         return costate, (e, push / jnp.sqrt(weight[0]))
 
@@ -259,22 +259,23 @@ def _climb(m: Moves, index, weights, before, last, costate):
 
 
 @jax.jit
-def _walk(m: Moves, index, weights, after, first, start):
-    """The cheapest way on from e_first, with the factors ``after`` of S_1 .. S_t."""
+def _walk(m: Moves, index, weights, after, planned, start):
+    """Along the ``planned`` errors and moves, and the cheapest way on where these are 0, with the
+    factors ``after`` of S_1 .. S_t. What rounding left of the plan is corrected as cheaply.
+    """
 
     def one(e, at):
-        i, index, weight, T = at
+        index, weight, T, to, v = at
         F, B, _ = _step(m, index, weight)
         reach, n = _times(T, B), T.shape[0]
         lower = triangle(jnp.concatenate([reach.T, jnp.eye(n)])).T
         # -B' S (I + B B' S)^-1 F e by the factor of I + T B B' T'
-        half = solve_lower(lower, jnp.ones(n, bool), T @ (F @ e))
+        half = solve_lower(lower, jnp.ones(n, bool), T @ (F @ (e - to)))
         whole = jax.scipy.linalg.solve_triangular(lower.T, half)
-        push = jnp.where(i >= first, -reach.T @ whole, 0.0)
-        after = jnp.where(i >= first, F @ e + B @ push, e)
-        return after, (e, push / jnp.sqrt(weight[0]))
+        v = v - reach.T @ whole / jnp.sqrt(weight[0])
+        return F @ e + B @ v * jnp.sqrt(weight[0]), (e, v)
 
-    return jax.lax.scan(one, start, (jnp.arange(len(index)), index, weights, after))[1]
+    return jax.lax.scan(one, start, (index, weights, after, *planned))[1]
 
 
 def cheapest(m: Moves, index, weights, k: int, goal, start) -> Path:
@@ -292,13 +293,10 @@ def cheapest(m: Moves, index, weights, k: int, goal, start) -> Path:
     filled = _padded(m, index, weights)
     more = np.zeros((len(filled[1]) - len(index), *T.shape[1:]))
     left, back = _climb(*filled, np.concatenate([L[:-1], more]), k, costate)
-    on = _walk(*filled, np.concatenate([T, more]), k, top)
-    past = (np.arange(len(index)) < k)[:, None]
-    e, v = (
-        np.where(past, np.asarray(x)[: len(index)], np.asarray(y)[: len(index)])
-        for x, y in zip(back, on, strict=True)
-    )
-    return travelled(m, index, e, v, start.T @ np.asarray(left))
+    first = start.T @ np.asarray(left)
+    on = _walk(*filled, np.concatenate([T, more]), back, start @ first)
+    e, v = (np.asarray(x)[: len(index)] for x in on)
+    return travelled(m, index, e, v, first)
 
 
 def travelled(m: Moves, index, before: np.ndarray, v: np.ndarray, first: np.ndarray) -> Path:

@@ -119,7 +119,7 @@ def stretches(
         if t > most and found is None:
             found = forever(setting)
         piece = Piece(0, t, None)
-        if t > most and found is not None and found.kept is not None:
+        if t > most and found is not None and found.kept is not None and ks[0] > found.after:
             first = _boundary(found, ks[0], t - most)
             piece = Piece(first, t, found.kept)
             place = (ks[0] - first, t - first)
@@ -136,7 +136,7 @@ def stretches(
 def _moved_on(share: np.ndarray | None, of: Long) -> np.ndarray | None:
     """The multipliers of the step before, each limit one step older; None where they do not fit."""
     count = len(of.b)
-    if share is None or count != len(of.index):
+    if share is None or count != len(of.index) or (share[-1] > 0) != (of.start is not None):
         return None
     if len(share) == count + 1:
         return share
@@ -152,8 +152,8 @@ def _groups(setting: Setting, steps: int) -> Iterator[tuple[range, int]]:
 
 
 def _boundary(found: Forever, k: int, least: int) -> int:
-    """The first step from ``least`` on that is a whole number of periods behind ``after``; one
-    period earlier where that is not before k.
+    """The first step from ``least`` on that is a whole number of periods behind ``after``; the
+    last one before k (> ``after``) where that is not before k.
     """
-    first = found.after + max(0, -(-(least - found.after) // found.period)) * found.period
-    return first if first < k else first - found.period
+    periods = min(-(-(least - found.after) // found.period), (k - 1 - found.after) // found.period)
+    return found.after + max(0, periods) * found.period

@@ -7,7 +7,7 @@ import numpy as np
 
 from holdfast.numerics.attack_sets import MOST
 from holdfast.numerics.attackable import growth
-from holdfast.numerics.multipliers import Certificate, Long, certificate, descended
+from holdfast.numerics.multipliers import Certificate, Long, certificate, descended, factors
 from holdfast.numerics.reachability import forward
 from holdfast.reach.pieces import Highest, Piece, highest, sizes_of, stretch, unknowns
 from holdfast.reach.setting import Setting
@@ -16,8 +16,10 @@ LONGEST = 2000
 """Steps of a period that is looked at."""
 TURNS = 400
 """Periods after which a set that still grows is given up."""
-MARGIN = 1.0 + 1e-6
-"""Growth over a period that counts as none, and that the set is enlarged by for it."""
+SETTLED = 1.0 + 1e-6
+"""Growth over a period from which on the limit is near."""
+MARGINS = (1.0 + 1e-6, 1.0 + 1e-4, 1.0 + 1e-3)
+"""What the set is enlarged by so that it is not below its limit."""
 ROUGH = 1e-3
 """Relative change of a set's size that is not worth another round."""
 FEW = 12
@@ -31,7 +33,7 @@ ROUNDS = 6
 class Forever(NamedTuple):
     """``bounded``: whether the error stays bounded for ever, decided by ``radius``, the largest
     modulus per step of what can be moved unseen (under 1: bounded); None where the period is too
-    long to look at.
+    long to look at. Never with ``sprt``, whose bound has no limit, unless nothing can be moved.
 
     ``kept``: a factor of an ellipsoid that holds e_after and every e a whole number of periods
     later; None where there is none, ``reason`` says why.
@@ -52,60 +54,46 @@ def forever(setting: Setting) -> Forever:
     period to period: W <- Y(W / mu_0; mu_1 .. mu_L), sum mu_j b_j = 1. What the map of a period
     sends into itself holds the error for ever, once it holds it at one step.
     """
-    period = _period(setting)
+    period = setting.period
+    if setting.enforced is not None:
+        return _none(setting, period, math.nan, None, "the policy is a table that ends")
     if period > LONGEST:
         return _none(setting, period, math.nan, None, f"the period of {period} steps is too long")
     s = setting.system
-    found = growth(s.A, s.C, s.K, setting.alterable(period, _start(setting)), aware=setting.aware)
+    found = growth(s.A, s.C, s.K, setting.alterable(period, setting.after), aware=setting.aware)
     if found.unbounded:
         why = f"a mode of modulus {found.radius:.6g} can be moved unseen"
         return _none(setting, period, found.radius, False, why)
     if setting.stealth.detector == "sprt":
-        why = "the bound of a sum of residuals grows with its length"
-        return _none(setting, period, found.radius, True, why)
+        why = "the bound of a sum of residuals grows with its length, beyond every limit"
+        still = not np.any(setting.moves(period, setting.after)[0].B)
+        return _none(setting, period, found.radius, still, why)
     kept = _kept(setting, period)
     if kept is None:
         return _none(setting, period, found.radius, True, "no set was found that a period keeps")
-    return Forever(period, found.radius, True, _start(setting), kept, None)
+    return Forever(period, found.radius, True, setting.after, kept, None)
 
 
 def _none(setting, period, radius, bounded, reason) -> Forever:
-    return Forever(period, radius, bounded, _start(setting), None, reason)
-
-
-def _period(setting: Setting) -> int:
-    """The least common multiple of the periods of the outputs that are attacked."""
-    if setting.enforcement is None:
-        return 1
-    every, duration, _ = setting.enforcement_fields
-    held = setting.compromised & (duration > 0)
-    return math.lcm(1, *(int(e) for e in every[held]))
-
-
-def _start(setting: Setting) -> int:
-    """A step from which on the policy is periodic: the end of the first blocks of all."""
-    if setting.enforcement is None:
-        return 0
-    _, duration, first = setting.enforcement_fields
-    held = setting.compromised & (duration > 0)
-    return int(np.max((first + duration - 1)[held], initial=0))
+    return Forever(period, radius, bounded, setting.after, None, reason)
 
 
 def _kept(setting: Setting, period: int) -> np.ndarray | None:
-    """A factor of a set that holds e at `_start` and that a period maps into itself.
+    """A factor of a set that holds e at `after` and that a period maps into itself.
 
     First with multipliers that fade evenly, then with those that suit the worst step of the
     period, chosen in turn with the set. Every one of them is sound; the best is taken.
     """
-    after, n = _start(setting), len(setting.system.A)
+    after, n = setting.after, len(setting.system.A)
     of = stretch(setting, Piece(after, after + period, np.eye(n)))
+    first = _fading_away(setting, of)
     best, least = None, math.inf
     for part in PARTS:
-        kept = _fixed(of, certificate(of, _fading(len(of.b), part, period)))
+        kept = _fixed(of, certificate(of, _fading(len(of.b), part, period)), first)
         if kept is not None and (size := _largest(setting, of, kept)[0]) < least:
             best, least = kept, size
     for _ in range(ROUNDS if best is not None else 0):
-        kept = _fixed(of, _suited(setting, of, best))
+        kept = _fixed(of, _suited(setting, of, best), first)
         if kept is None or (size := _largest(setting, of, kept)[0]) >= least * (1.0 - ROUGH):
             break
         best, least = kept, size
@@ -119,27 +107,63 @@ def _fading(count: int, part: float, period: int) -> np.ndarray:
     return np.append(np.resize(fade, count) / groups, (1.0 - part) ** period)
 
 
-def _fixed(of: Long, held: Certificate) -> np.ndarray | None:
-    """The set that the period map with this certificate keeps, from below; None if it grows on."""
+def _fading_away(setting: Setting, of: Long) -> np.ndarray:
+    """A factor of a set that holds e at `after`, where a period's moves do not reach all of it:
+    what could be moved before the policy began, and can no more. Else zero.
+    """
+    n = len(setting.system.A)
+    nothing = np.zeros((n, n))
+    early = stretch(setting, Piece(0, setting.after, None)) if setting.after else None
+    if early is None or unknowns(early) == 0:
+        return nothing
+    held = descended(early, np.eye(n), setting.after, rounds=FEW).held
+    first = factors(early, held)[-1]
+    even = certificate(of, np.append(np.ones(len(of.b)), float(len(of.b))))
+    W = nothing
+    for _ in range(n):
+        W = _after(of, even, W)
+    return nothing if np.isfinite(_ratio(first, W)) else first
+
+
+def _fixed(of: Long, held: Certificate, more: np.ndarray) -> np.ndarray | None:
+    """A set that the period map with this certificate sends into itself, just above the limit of
+    those reached from nothing, ``more`` (a factor) being added to each; None where these grow on.
+    """
     W = np.zeros_like(held.start)
-    fade = float(held.share[-1])
     for _ in range(TURNS):
-        new = forward(of.m, of.index, held.weights, W / np.sqrt(fade))[-1]
+        new = _after(of, held, W)
+        if np.any(more):
+            new = np.linalg.qr(np.hstack([new, more]).T, mode="r").T
         if not np.all(np.isfinite(new)):
             return None
-        # if W goes into MARGIN^2 W, then MARGIN^2 W goes into itself: the map of t W is at most
-        # t times that of W for t >= 1
-        if _ratio(new, W) <= MARGIN:
-            return W * MARGIN
+        if _ratio(new, W) <= SETTLED:
+            for margin in MARGINS:
+                # larger by a little everywhere, and what the attacker adds is not: it shrinks
+                if _ratio(_after(of, held, new * margin), new * margin) <= 1.0:
+                    return new * margin
         W = new
     return None
 
 
+def _after(of: Long, held: Certificate, W: np.ndarray) -> np.ndarray:
+    """A factor of the set after a period, from one of the set before it."""
+    start = W / np.sqrt(float(held.share[-1]))
+    return forward(of.m, of.index, held.weights, start)[-1]
+
+
 def _ratio(inner: np.ndarray, outer: np.ndarray) -> float:
     """The least t with inner inner' <= t^2 outer outer', inf where there is none."""
+    unit = _units(outer, inner)
+    outer, inner = outer / unit, inner / unit
     found, *_ = np.linalg.lstsq(outer, inner, rcond=1e-13)
     left = np.linalg.norm(outer @ found - inner)
     return np.inf if left > 1e-9 * np.linalg.norm(inner) else float(np.linalg.norm(found, 2))
+
+
+def _units(*of: np.ndarray) -> np.ndarray:
+    """Units of the states (n x 1) in which the rows of factors are of size one, or zero."""
+    sizes = np.linalg.norm(np.hstack(of), axis=1, keepdims=True)
+    return np.where(sizes > 0, sizes, 1.0)
 
 
 def _largest(setting: Setting, of: Long, kept: np.ndarray) -> tuple[float, int]:
@@ -167,14 +191,15 @@ def _suited(setting: Setting, of: Long, kept: np.ndarray) -> Certificate:
 
 
 def _held(setting: Setting, kept: np.ndarray) -> float:
-    """What the set has to be multiplied by to hold every e at `_start`; at least 1."""
-    after = _start(setting)
+    """What the set has to be multiplied by to hold every e at `after`; at least 1."""
+    after = setting.after
     if after == 0:
         return 1.0
     of = stretch(setting, Piece(0, after, None))
     if unknowns(of) == 0:
         return 1.0
-    return max(1.0, descended(of, np.linalg.pinv(kept), after).upper)
+    unit = _units(kept)
+    return max(1.0, descended(of, np.linalg.pinv(kept / unit) / unit.T, after).upper)
 
 
 def worst(setting: Setting, found: Forever, limit: float = math.inf) -> Highest | None:

@@ -1,5 +1,6 @@
 """Who attacks what: the filter in its steady state, the detector, the attacker, the policy."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -35,6 +36,24 @@ class Setting(NamedTuple):
         if self.enforcement is None:
             return 1
         return max(1, int(np.max(np.where(self.compromised, self.enforcement.duration, 0))))
+
+    @property
+    def period(self) -> int:
+        """The least common multiple of the periods of the outputs that are attacked."""
+        if self.enforcement is None:
+            return 1
+        every, duration, _ = self.enforcement_fields
+        held = self.compromised & (duration > 0)
+        return math.lcm(1, *(int(e) for e in every[held]))
+
+    @property
+    def after(self) -> int:
+        """A step from which on the policy is periodic: the end of the first blocks of all."""
+        if self.enforcement is None:
+            return 0
+        _, duration, first = self.enforcement_fields
+        held = self.compromised & (duration > 0)
+        return int(np.max((first + duration - 1)[held], initial=0))
 
     def alterable(self, steps: int, first: int = 0) -> np.ndarray:
         """Which outputs can be altered at the steps first + 1 .. first + steps (steps x p)."""

@@ -1,0 +1,251 @@
+"""The rarest authentication that keeps a stealthy attacker's error under a limit."""
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from holdfast.numerics.attackable import growth_of, movable
+from holdfast.numerics.subspaces import scaled, silent
+from holdfast.parts import InvalidValue
+from holdfast.reach.bounds import reach as reach_of
+from holdfast.reach.bounds import stretches
+from holdfast.reach.forever import forever, worst
+from holdfast.reach.pieces import highest
+from holdfast.reach.setting import Setting
+from holdfast.records import Enforcement
+
+MOST = 400
+"""Steps between two blocks that are tried at most."""
+BEYOND = 3
+"""Longer distances that are tried after one has failed: the error need not grow with it where the
+plant turns, and an even distance can see less than an odd one."""
+MULTIPLES = (2, 3, 4)
+"""Of the others' distance that a sensor of its own may have."""
+
+Told = Callable[[str], Any]
+
+
+class Reached(NamedTuple):
+    """``value``: the largest error, from above; ``proof`` "horizon" or "period"."""
+
+    value: float
+    proof: str
+
+
+class Policy(NamedTuple):
+    """``enforcement`` None: nothing need be authenticated. ``worst``: the error that is reached,
+    from above. ``share``: authenticated messages over all; ``cost``: what they cost a step.
+    ``tried``: how many policies were looked at.
+    """
+
+    enforcement: Enforcement | None
+    worst: float
+    limit: float
+    share: float
+    cost: float
+    steps: int | None
+    proof: str
+    tried: int
+
+
+def greatest(setting: Setting, steps: int | None, limit: float = math.inf) -> Reached:
+    """The largest error over ``steps``, or ever; over ``limit`` the first one found that is.
+
+    Raises `InvalidValue` where no bound holds for ever because the detector sums for ever.
+    """
+    if steps is not None:
+        return Reached(_within(setting, steps, limit), "horizon")
+    if setting.stealth.detector == "sprt":
+        raise InvalidValue(
+            "steps",
+            "none with the detector sprt, whose bound grows with the length of the sum",
+            "a number of steps, or the detector chi_square or windowed",
+        )
+    found = forever(setting)
+    top = worst(setting, found, limit)
+    return Reached(math.inf if top is None else top.value, "period")
+
+
+def _within(setting: Setting, steps: int, limit: float) -> float:
+    if setting.stealth.detector == "sprt":
+        return float(np.max(reach_of(setting, steps).norm, initial=0.0))
+    value = 0.0
+    for piece, _, ks, like in stretches(setting, steps, tight=False):
+        if not like:
+            value = max(value, highest(setting, piece, ks, limit).value)
+        if value > limit:
+            break
+    return value
+
+
+def policy(
+    setting: Setting,
+    limit: float,
+    steps: int | None = None,
+    costs: Sequence[float] | None = None,
+    per_sensor: bool = False,
+    told: Told = lambda text: None,
+) -> Policy:
+    """The policy of least cost with |functional E e_k| <= ``limit`` at every k <= ``steps``, or ever.
+
+    All outputs together, ``for`` steps in a row every ``every``, the first block at ``every``;
+    ``for`` up to the smaller of observability index and unstable modes (Theorem 4). With
+    ``per_sensor`` also each output its own: which of them, staggered, at distances of their own.
+    ``costs`` (p,): of an authenticated message of each output, 1 unless given. ``told`` hears of
+    every candidate. The setting's own enforcement is not looked at.
+
+    Raises `InvalidValue` for a limit or a cost that is none.
+
+    Source: INTEGRITY, Algorithm 1, with a stopping rule that is a proof.
+    """
+    p = len(setting.compromised)
+    price = np.ones(p) if costs is None else np.asarray(costs, float)
+    if price.shape != (p,) or not np.all(np.isfinite(price)) or np.any(price <= 0):
+        raise InvalidValue("cost", costs, f"{p} positive numbers, one per output")
+    if not (math.isfinite(limit) and limit > 0):
+        raise InvalidValue("limit", limit, "a positive number")
+    search = _Search(setting, limit, steps, price, told)
+    free = search.reached(None)
+    if free.value <= limit:
+        return search.found(None, free)
+    best = min((search.together(f) for f in search.durations()), key=_cost)
+    if per_sensor:
+        best = min(best, search.apart(best), key=_cost)
+    return best
+
+
+def _cost(found: Policy) -> float:
+    return found.cost
+
+
+class _Search:
+    """One search: what is asked, and what has been tried."""
+
+    def __init__(self, setting: Setting, limit: float, steps: int | None, price, told: Told):
+        self.setting, self.limit, self.steps, self.price, self.told = (
+            setting, limit, steps, price, told,
+        )  # fmt: skip
+        self.tried = 0
+        s = setting.system
+        self.modes = movable(s.A, s.C, s.K)
+
+    def reached(self, enforcement: Enforcement | None) -> Reached:
+        """What the attacker reaches under a policy."""
+        self.tried += 1
+        asked = self.setting._replace(enforcement=enforcement)
+        if self.steps is None and not self._bounded(asked):
+            return Reached(math.inf, "period")
+        return greatest(asked, self.steps, self.limit)
+
+    def _bounded(self, asked: Setting) -> bool:
+        """Cheap, and exact: whether there is a bound at all."""
+        period = 1 if asked.enforcement is None else asked.period
+        rows = asked.alterable(period, asked.after)
+        return not growth_of(self.modes, rows, aware=asked.aware).unbounded
+
+    def found(self, enforcement: Enforcement | None, reached: Reached) -> Policy:
+        """The record of a policy that does."""
+        shares = np.zeros(len(self.price)) if enforcement is None else enforcement.share
+        shares = np.asarray(shares)
+        cost = float(shares @ self.price)
+        return Policy(
+            enforcement, reached.value, self.limit, float(np.mean(shares)), cost, self.steps,
+            reached.proof, self.tried,
+        )  # fmt: skip
+
+    def durations(self) -> range:
+        """Lengths of a block worth trying."""
+        s = self.setting.system
+        told = silent(scaled(s.A, np.zeros((len(s.A), 0)), s.C, np.zeros((len(s.C), 0))))
+        # told has an entry for no sample, and one for each that adds something
+        return range(1, max(1, min(len(told) - 1, self.modes.unstable)) + 1)
+
+    def together(self, duration: int) -> Policy:
+        """All outputs at once: the longest distance that does, by doubling and halving."""
+        p = len(self.price)
+
+        def made(every: int) -> Enforcement:
+            return Enforcement.of([every] * p, duration, every)
+
+        return self._longest(made, duration)
+
+    def _longest(self, made: Callable[[int], Enforcement], shortest: int) -> Policy:
+        """The largest ``every`` for which ``made(every)`` does; ``shortest``, always on, does."""
+
+        def tried(every: int) -> Reached:
+            self.told(f"every {every}")
+            return self.reached(made(every))
+
+        good, value = shortest, Reached(0.0, "period" if self.steps is None else "horizon")
+        step, bad = 1, None
+        while bad is None and good < MOST:
+            every = min(MOST, good + step)
+            now = tried(every)
+            if now.value <= self.limit:
+                good, value, step = every, now, 2 * step
+            else:
+                bad = every
+        while bad is not None and bad - good > 1:
+            middle = (good + bad) // 2
+            now = tried(middle)
+            if now.value <= self.limit:
+                good, value = middle, now
+            else:
+                bad = middle
+        for every in range(good + 2, min(good + 2 + BEYOND, MOST + 1)) if bad else ():
+            now = tried(every)
+            if now.value <= self.limit:
+                good, value = every, now
+        return self.found(made(good), value)
+
+    def apart(self, together: Policy) -> Policy:
+        """Each output its own schedule: which of those attacked, staggered over a common distance;
+        then one by one at a multiple of it.
+        """
+        hit = np.flatnonzero(self.setting.compromised)
+        best = together
+        for count in range(1, len(hit) + 1):
+            for chosen in itertools.combinations(hit, count):
+                for duration in self.durations():
+                    found = self._staggered(np.array(chosen), duration)
+                    if found.cost < best.cost * (1.0 - 1e-9):
+                        best = found
+        return self._slower(best)
+
+    def _staggered(self, chosen: np.ndarray, duration: int) -> Policy:
+        """The outputs ``chosen`` in turn, evenly spread over the distance."""
+        p = len(self.price)
+
+        def made(every: int) -> Enforcement:
+            lasting, first = np.zeros(p, int), np.ones(p, int)
+            lasting[chosen] = duration
+            turn = np.arange(len(chosen)) * every // len(chosen)
+            first[chosen] = np.maximum(2, every - turn)
+            return Enforcement.of([every] * p, lasting, first)
+
+        if self._always(made(duration)):
+            return self._longest(made, duration)
+        return self.found(made(duration), Reached(math.inf, ""))._replace(cost=math.inf)
+
+    def _always(self, enforcement: Enforcement) -> bool:
+        return self.reached(enforcement).value <= self.limit
+
+    def _slower(self, best: Policy) -> Policy:
+        """One output after the other at a multiple of its distance, where that still does."""
+        if best.enforcement is None:
+            return best
+        for i in np.flatnonzero(np.asarray(best.enforcement.duration)):
+            for times in MULTIPLES:
+                held = best.enforcement
+                every = np.array(held.every)
+                every[i] = int(np.asarray(held.every)[i]) * times
+                now = Enforcement.of(every, held.duration, held.first)
+                reached = self.reached(now)
+                if reached.value > self.limit:
+                    break
+                better = self.found(now, reached)
+                best = min(best, better, key=_cost)
+        return best
