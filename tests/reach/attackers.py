@@ -16,7 +16,8 @@ from scipy.optimize import brentq
 from scipy.stats import chi2, ncx2
 
 from holdfast.numerics.stealth import Stealth
-from holdfast.reach.setting import Setting, Watched
+from holdfast.plants.watched import Watched
+from holdfast.reach.setting import Setting
 from holdfast.records import Enforcement
 
 
@@ -114,7 +115,7 @@ class Attacks(NamedTuple):
 
 def written(setting, t, k, tight=False) -> Attacks:
     """The stealthy attacks over t steps; one who does not know the policy has to be ready for
-    an authenticated block in place of each step up to k + 1.
+    an authenticated block in place of each of them; if only a sum is bounded, behind k.
     """
     s, block = setting.system, 0 if setting.aware else setting.blocks
     root = np.linalg.cholesky(s.Q)
@@ -135,12 +136,13 @@ def written(setting, t, k, tight=False) -> Attacks:
         errors.append(e)
     limits = []
     whole = setting.stealth.detector == "sprt" and not tight
-    for end in [t] if whole and setting.aware else [] if whole else range(1, t + 1):
+    ends = [t] * setting.aware if whole else range(1, t + 1)
+    for end in ends:
         limits += _tested(setting, shown[:end], end)
     if block and whole:
         limits += _tested(setting, shown[:k] + ready[k], k + block)
     elif block:
-        for i in range(k + 1):
+        for i in range(t):
             for j in range(block):
                 limits += _tested(setting, shown[:i] + ready[i][: j + 1], i + j + 1)
     return Attacks(np.array(errors), limits)
@@ -179,9 +181,17 @@ def furthest(found: Attacks, c) -> np.ndarray:
     return np.array(solution.x)
 
 
-def largest(setting, k, t, tight=False, starts=6, seed=0) -> float:
+def largest(setting, k, tight=False, starts=6, seed=0) -> float:
     """The largest |functional e_k| that ascents from several directions find."""
-    found = written(setting, t, k, tight)
+    t = horizon(setting, k) + (not setting.aware)
+    if setting.stealth.detector == "sprt" and not tight and not setting.aware:
+        # one sum is bounded: behind k or where the policy's block ends
+        known = largest(setting._replace(aware=True), k, tight, starts, seed)
+        return min(known, _climbed(written(setting, t, k), setting, k, starts, seed))
+    return _climbed(written(setting, t, k, tight), setting, k, starts, seed)
+
+
+def _climbed(found: Attacks, setting, k, starts, seed) -> float:
     B = setting.functional @ found.errors[k]
     if not np.any(B):
         return 0.0

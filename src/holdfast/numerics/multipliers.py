@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csr_array
 
-from holdfast.numerics.reachability import Moves, Path, backward, cheapest, forward, joined
+from holdfast.numerics.reachability import Moves, Path, backward, forward, joined, longest
 
 ROUNDS = 60
 """Times that the multipliers are improved; the bounds close in like one over it."""
@@ -106,24 +106,21 @@ def _lower(one: Descended) -> float:
 def _turn(of: Long, functional: np.ndarray, k: int, share: np.ndarray) -> Descended:
     """Both bounds by one set of multipliers."""
     held = certificate(of, share)
-    L = forward(of.m, of.index[:k], held.weights[:k], held.start)[-1:]
-    T = backward(of.m, of.index, held.weights, np.zeros(len(of.index), np.int32))
-    left, sizes, _ = np.linalg.svd(functional @ joined(L, T[k - 1][None])[0])
-    goal = functional.T @ left[:, 0]
-    path = cheapest(of.m, of.index, held.weights, k, goal, held.start)
-    most = float(np.max(_spent(of, held, path)))
+    size, path = longest(of.m, of.index, held.weights, k, functional, held.start)
+    if of.start is not None:
+        path = path._replace(first=path.first / np.sqrt(held.share[-1]))
+    most = float(np.max(_spent(of, path)))
     scale = 1.0 / np.sqrt(most) if most > 0 else 0.0
     path = Path(path.e * scale, path.a * scale, path.cost * scale**2, path.first * scale)
     reached = float(np.linalg.norm(functional @ path.e[k - 1]))
-    return Descended(float(sizes[0]), reached, held, path)
+    return Descended(size, reached, held, path)
 
 
-def _spent(of: Long, held: Certificate, path: Path) -> np.ndarray:
+def _spent(of: Long, path: Path) -> np.ndarray:
     """What an attack uses of every limit, and of the first ellipsoid: 1 is all of it."""
     costs = np.concatenate([path.cost[:, 0], path.cost[:, 1:].reshape(-1)])
-    start = 0.0 if of.start is None else np.sum(path.first**2) / held.share[-1]
-    return np.append((of.w @ costs) / of.b, start)
+    return np.append((of.w @ costs) / of.b, np.sum(path.first**2))
 
 
 def _next_share(of: Long, found: Descended) -> np.ndarray:
-    return found.held.share * np.sqrt(_spent(of, found.held, found.path))
+    return found.held.share * np.sqrt(_spent(of, found.path))

@@ -153,17 +153,25 @@ def _still(m: Moves) -> Moves:
     return Moves(*rows, m.ahead)
 
 
+def _length(t: int) -> int:
+    """The next of 16, 64, 256, 512, 1024, ..."""
+    return next((size for size in (16, 64, 256) if t <= size), 1 << (t - 1).bit_length())
+
+
 def _padded(m: Moves, index, *rows):
     """The moves, and everything of length t filled up with still steps to a length that many
     share: a program for every length would be compiled for every length.
     """
     t = len(index)
-    more = max(16, 1 << (t - 1).bit_length()) - t
+    more = _length(t) - t
     index = np.concatenate([index, np.full(more, m.F.shape[0])]).astype(np.int32)
     filled = []
     for row in rows:
-        tail = np.ones if row.ndim == 2 else np.zeros
-        filled.append(np.concatenate([row, tail((more, *row.shape[1:]), row.dtype)]))
+        tail = np.zeros((more, *row.shape[1:]), row.dtype)
+        if row.ndim == 2:
+            # a step divides by its weight; nothing is ahead of a still one
+            tail[:, 0] = 1.0
+        filled.append(np.concatenate([row, tail]))
     return _still(m), index, *filled
 
 
@@ -191,7 +199,6 @@ def backward(m: Moves, index, weights, ends) -> np.ndarray:
 def _forward(
     m: Moves, index: Int[Array, " t"], weights: Float[Array, "t c"], start: Float[Array, "n n"]
 ) -> Float[Array, "t n n"]:
-
     def one(L, at):
         L = forward_step(*_step(m, *at), L)
         return L, L
@@ -216,7 +223,7 @@ def _backward(
 def joined(L: np.ndarray, T: np.ndarray) -> np.ndarray:
     """Factors of (W^-1 + S)^-1 for stacks (t x n x n) of factors of W and S."""
     t, n = L.shape[:2]
-    more = np.zeros((max(16, 1 << (t - 1).bit_length()) - t, n, n))
+    more = np.zeros((_length(t) - t, n, n))
     return np.asarray(_joined(*(np.concatenate([x, more]) for x in (L, T))))[:t]
 
 
@@ -237,7 +244,6 @@ class Path(NamedTuple):
     first: np.ndarray
 
 
-@jax.jit
 def _climb(m: Moves, index, weights, before, last, costate):
     """The cheapest way to e_last: costates going back (Bryson and Frazier), with the factors
     ``before`` of W_0 .. W_{t-1}. Steps after ``last`` are left at zero.
@@ -258,7 +264,6 @@ def _climb(m: Moves, index, weights, before, last, costate):
     return jax.lax.scan(one, costate, rows, reverse=True)
 
 
-@jax.jit
 def _walk(m: Moves, index, weights, after, planned, start):
     """Along the ``planned`` errors and moves, and the cheapest way on where these are 0, with the
     factors ``after`` of S_1 .. S_t. What rounding left of the plan is corrected as cheaply.
@@ -278,25 +283,44 @@ def _walk(m: Moves, index, weights, after, planned, start):
     return jax.lax.scan(one, start, (index, weights, after, *planned))[1]
 
 
+@jax.jit
+def _attack(m: Moves, index, weights, last, k, functional, start):
+    """The longest axis of functional e_k, and the cheapest attack to its end; nothing behind the
+    step ``last`` costs.
+    """
+    ends = (jnp.arange(len(index)) == last - 1).astype(jnp.int32)
+    L = jnp.concatenate([start[None], _forward(m, index, weights, start)])
+    T = _backward(m, index, weights, ends)
+    half = informed(L[k], T[k - 1])
+    seen = functional @ half
+    sizes, axes = jnp.linalg.eigh(seen @ seen.T)
+    goal = functional.T @ axes[:, -1]
+    top = half @ (half.T @ goal)
+    # the costate before the cost to come: W costate = Y goal
+    costate = goal - T[k - 1].T @ (T[k - 1] @ top)
+    left, planned = _climb(m, index, weights, L[:-1], k, costate)
+    first = start.T @ left
+    return jnp.sqrt(sizes[-1]), first, _walk(m, index, weights, T, planned, start @ first)
+
+
+def longest(m: Moves, index, weights, k: int, functional, start) -> tuple[float, Path]:
+    """The largest |functional e_k| over the attacks that cost at most 1 over t steps, and one that
+    reaches it: functional e_k = its square times a unit vector along its axis, for that cost.
+
+    ``functional`` (q x n); ``start``: as in `forward`. The cost of the path is its size squared.
+    """
+    size, first, on = _attack(*_padded(m, index, weights), len(index), k, functional, start)
+    e, v = (np.asarray(x)[: len(index)] for x in on)
+    return float(size), travelled(m, index, e, v, np.asarray(first))
+
+
 def cheapest(m: Moves, index, weights, k: int, goal, start) -> Path:
     """Of all attacks over t steps with e_k = Y goal the one of least total weighted cost.
 
     ``goal`` (n,) is a direction of interest: Y goal is where the ellipsoid of Y (the e_k that cost
     at most 1 from the start to t) reaches furthest along it. ``start``: as in `forward`.
     """
-    L = np.concatenate([start[None], forward(m, index, weights, start)])
-    T = backward(m, index, weights, np.zeros(len(index), np.int32))
-    shape = joined(L[k][None], T[k - 1][None])[0]
-    top = shape @ (shape.T @ goal)
-    # the costate before the cost to come: W costate = Y goal
-    costate = goal - T[k - 1].T @ (T[k - 1] @ top)
-    filled = _padded(m, index, weights)
-    more = np.zeros((len(filled[1]) - len(index), *T.shape[1:]))
-    left, back = _climb(*filled, np.concatenate([L[:-1], more]), k, costate)
-    first = start.T @ np.asarray(left)
-    on = _walk(*filled, np.concatenate([T, more]), back, start @ first)
-    e, v = (np.asarray(x)[: len(index)] for x in on)
-    return travelled(m, index, e, v, first)
+    return longest(m, index, weights, k, np.asarray(goal)[None], start)[1]
 
 
 def travelled(m: Moves, index, before: np.ndarray, v: np.ndarray, first: np.ndarray) -> Path:

@@ -2,11 +2,12 @@
 
 from collections.abc import Callable
 
-from holdfast.papers import care, decoder, decompose
+from holdfast.papers import care, decoder, decompose, integrity
 from holdfast.papers.rows import Study
 
 STUDIES: dict[str, Callable[[], Study]] = {
     "care": care.study,
     "decompose": decompose.study,
     "decoder": decoder.study,
+    "integrity": integrity.study,
 }

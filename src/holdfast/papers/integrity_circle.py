@@ -60,8 +60,8 @@ class Run(NamedTuple):
 def circle(steps: int) -> np.ndarray:
     """The course (steps x 4) from step 1 on.
 
-    Written as complex numbers, p = r exp(i t k), v = r (1 - exp(-i t)) / dt exp(i t k) and a turning
-    acceleration satisfy both equations of (62) exactly.
+    Written as complex numbers, p = r exp(i t k), v = r (1 - exp(-i t)) / dt exp(i t k) and an
+    acceleration that turns along satisfy both equations of (62) exactly.
     """
     turn = SPEED / RADIUS * DT
     place = RADIUS * np.exp(1j * turn * np.arange(1, steps + 1))

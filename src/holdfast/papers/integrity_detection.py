@@ -127,7 +127,9 @@ def under(c: Sequence[float], p: int, h: float, epsilon: float = EPSILON) -> flo
     return alpha_chi2(epsilon, T * p, h / max(c)) / np.sqrt(T)
 
 
-def summed_rise(c: Sequence[float], p: int, h: float, shifts: Sequence[float]) -> float:
+def summed_rise(
+    c: Sequence[float], p: int, h: float, shifts: Sequence[float] | np.ndarray
+) -> float:
     """By how much the alarm probability of the weighted sum rises."""
     kept = np.asarray(c) > 0
     w, s = np.asarray(c)[kept], np.asarray(shifts, float)[kept]
@@ -168,9 +170,7 @@ def lemma_1_levels(levels: Sequence[float] = LEVELS, bound: float = 0.3) -> Row:
         summed_rise((0.0, 1.0), 1, h, [under((0.0, 1.0), 1, h)] * 2) / EPSILON
         for h in (float(chdtri(1, level)) for level in levels)
     ]
-    harmless = all(
-        rise <= 1.0 for rise, level in zip(rises, levels, strict=True) if level <= bound
-    )
+    harmless = all(rise <= 1.0 for rise, level in zip(rises, levels, strict=True) if level <= bound)
     return claim(
         "Lemma 1, by false-alarm rate", "c = (0, 1), p = 1 at beta = .65, .5, .3, .1, .01: rise "
         "over epsilon, at most 1 for beta up to .3", None, rises, harmless,

@@ -37,17 +37,19 @@ def _gain(of: System, sigma: np.ndarray) -> np.ndarray:
 
 
 def equation_3(predicted: bool = False, plants: Sequence[System] | None = None) -> Row:
-    """The gain of (3) from Cov(e_k), or from the covariance before the sample."""
-    every = [VEHICLE, *drawn(30, 3)] if plants is None else plants
-    off = max(_gap(_gain(of, of.P_pred if predicted else spread(of)), of.K) for of in every)
+    """K and Q of (3) and (4) from Cov(e_k), or from the covariance before the sample."""
+    off = 0.0
+    for of in [VEHICLE, *drawn(30, 3)] if plants is None else plants:
+        sigma = of.P_pred if predicted else spread(of)
+        off = max(off, _gap(_gain(of, sigma), of.K), _gap(of.C @ sigma @ of.C.T + of.R, of.S))
     if predicted:
-        id, what, note = "(3), a priori", "with the covariance of x_k before sample k", ""
+        id, what, note = "(3), (4), a priori", "with the covariance of x_k before sample k", ""
     else:
-        id, what = "(3)", "with Sigma the covariance of the estimation error e_k of (5)"
+        id, what = "(3), (4)", "with Sigma the covariance of the estimation error e_k of (5)"
         note = "Of x - x^ after the sample; (3) and (4) need the one before it (next row)."
     return claim(
-        id, f"K = Sigma C'(C Sigma C' + R)^-1 {what}: largest relative distance from the "
-        "filter's K", 0.0, off, off < 1e-7, note,
+        id, f"K and Q = C Sigma C' + R {what}: largest relative distance from the filter's K and "
+        "E zz'", 0.0, off, off < 1e-7, note,
     )  # fmt: skip
 
 
@@ -144,7 +146,9 @@ def theorem_2(count: int = 12, steps: int = 5, scale: float = 1.0) -> Row:
     )  # fmt: skip
 
 
-def theorem_2_norms(root: bool = False, plants: Sequence[System] | None = None) -> Row:
+def theorem_2_norms(
+    root: bool = False, plants: Sequence[System] | None = None, off: float = 1.0
+) -> Row:
     """The two norms of random shifts."""
     rng, most = default_rng(7), 0.0
     for of in [VEHICLE, *drawn(30, 7)] if plants is None else plants:
@@ -152,7 +156,7 @@ def theorem_2_norms(root: bool = False, plants: Sequence[System] | None = None) 
         z = rng.normal(size=(200, len(of.C)))
         white = np.sqrt(np.sum(z * np.linalg.solve(of.S, z.T).T, 1)) / np.linalg.norm(z, axis=1)
         power = 0.5 if root else 1.0
-        most = max(most, float(np.max(white) * values[0] ** power))
+        most = max(most, off * float(np.max(white) * values[0] ** power))
         most = max(most, float(1.0 / np.min(white) / values[-1] ** power))
     name = "1/sqrt(lambda)" if root else "1/lambda"
     return claim(
@@ -163,9 +167,9 @@ def theorem_2_norms(root: bool = False, plants: Sequence[System] | None = None) 
     )  # fmt: skip
 
 
-def remark_3(h: float = 9.0, p: int = 1, grows: bool = False) -> Row:
+def remark_3(h: float = 9.0, p: int = 1, grows: bool = False, last: int = 200) -> Row:
     """Lemma 1 with T = k: shifts within the alpha of k at an earlier step k'."""
-    steps = np.arange(1, 201)
+    steps = np.arange(1, last + 1)
     if grows:
         thresholds = 2.0 * h + steps * p
     else:
@@ -175,7 +179,8 @@ def remark_3(h: float = 9.0, p: int = 1, grows: bool = False) -> Row:
     alpha = alphas(EPSILON, steps * p * 1.0, thresholds)
     each = alpha[-1] / np.sqrt(steps[-1])
     rises = [
-        risen(k * each**2, k * p, x) / EPSILON for k, x in zip(steps, thresholds, strict=True)
+        risen(k * each**2, k * p, x) / EPSILON
+        for k, x in zip(steps.tolist(), thresholds.tolist(), strict=True)
     ]
     single = [alpha_chi2(EPSILON, p, float(x)) for x in thresholds]
     beyond = float(np.max(alpha / single))
@@ -192,3 +197,39 @@ def remark_3(h: float = 9.0, p: int = 1, grows: bool = False) -> Row:
            "what is within it at k is not stealthy before."),
     )  # fmt: skip
 
+
+def equation_53(corrected: bool = False, of: System = VEHICLE) -> Row:
+    """The Sigma of gamma Sigma in (53) against Cov(e)."""
+    said = (np.eye(len(of.A)) - of.K @ of.C) @ of.P_pred if corrected else of.P_pred
+    ours = spread(of)
+    off = float(np.max(np.abs(said - ours)) / np.max(np.abs(ours)))
+    id, name = ("(53), (I - KC) Sigma", "(I - KC) Sigma") if corrected else ("(53)", "Sigma")
+    return claim(
+        id, f"gamma Cov(e^a_k) is gamma {name} of (3): relative difference of {name} from Cov(e_k) "
+        "on the vehicle", 0.0, off, off < 1e-8,
+        "" if corrected else "As in (13): the region is then larger than meant.",
+    )  # fmt: skip
+
+
+def gamma(count: int = 40, seed: int = 36, scale: float = 1.0) -> Row:
+    """Union over m m' <= Y~ of {e e' <= m m' + gamma Sigma}: the least e'(m m' + ..)^-1 e of an
+    e on the edge of (53), its m from (Y~^-1 + (gamma Sigma)^-1)^-1 (gamma Sigma)^-1 e.
+    """
+    rng, low, high = default_rng(seed), np.inf, 0.0
+    for n in (2, 3):
+        for _ in range(count):
+            Y, spread_ = (m @ m.T for m in rng.normal(size=(2, n, n)))
+            e = np.linalg.cholesky(Y + spread_) @ rng.normal(size=n)
+            e *= scale / np.sqrt(e @ np.linalg.solve(Y + spread_, e))
+            m = np.linalg.solve(
+                np.linalg.inv(Y) + np.linalg.inv(spread_), np.linalg.solve(spread_, e)
+            )
+            m /= np.sqrt(m @ np.linalg.solve(Y, m))
+            value = float(e @ np.linalg.solve(np.outer(m, m) + spread_, e))
+            low, high = min(low, value), max(high, value)
+    return claim(
+        "(53), gamma", "{ee' <= Y~ + gamma Sigma} is the union of (41) over mm' <= Y~: least and "
+        "largest e'(mm' + gamma Sigma)^-1 e, e on its edge, best m", [1.0, 1.0], [low, high],
+        abs(low - 1.0) < 1e-6 and abs(high - 1.0) < 1e-6,
+        "What the set has to do with a confidence is Definition 2's row.",
+    )  # fmt: skip

@@ -25,9 +25,11 @@ CELLS = 400
 """Of the test's statistic between its two thresholds."""
 
 
-def equation_46(corrected: bool = False, p: int = 2, h: float = H) -> Row:
+def equation_46(
+    corrected: bool = False, p: int = 2, h: float = H, mean: float | None = None
+) -> Row:
     """The mean of a step's log likelihood ratio without attack: E z'Q^-1 z = p."""
-    drift = 0.5 * p + (-0.5 * p if corrected else -0.5 * h)
+    drift = 0.5 * (p if mean is None else mean) + (-0.5 * p if corrected else -0.5 * h)
     id, power = ("(46), c with e^(-p/2)", "-p/2") if corrected else ("(46)", "-h/2")
     return claim(
         id, f"c = e^({power}) / sqrt((2 pi)^p det Q) makes the ratio Lambda_k zero without "
@@ -37,12 +39,18 @@ def equation_46(corrected: bool = False, p: int = 2, h: float = H) -> Row:
     )  # fmt: skip
 
 
-def equation_47(corrected: bool = False, steps: Sequence[int] = (1, 10, 100), p: int = 2) -> Row:
+def equation_47(
+    corrected: bool = False,
+    p: int = 2,
+    h: float = H,
+    off: float = 1.0,
+    steps: Sequence[int] = (1, 10, 100),
+) -> Row:
     """By how much alarms rise where (47) has equality, with the threshold that c makes."""
     rises = []
     for k in steps:
-        threshold = 2.0 * H + k * (p if corrected else H)
-        bound = float(alpha(np.array([k]), p, H)[0])
+        threshold = 2.0 * h + k * (p if corrected else h)
+        bound = off * float(alpha(np.array([k]), p, h)[0])
         rises.append(risen(bound**2, k * p, threshold) / EPSILON)
     id = "(47), c with e^(-p/2)" if corrected else "(47)"
     return claim(

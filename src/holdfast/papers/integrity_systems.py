@@ -41,7 +41,7 @@ class System(NamedTuple):
         return sum(abs(z) >= 1.0 for z in self.values)
 
     @property
-    def index(self) -> int:
+    def observability_index(self) -> int:
         """psi, the observability index."""
         n, powers = len(self.A), [self.C]
         while rank(np.vstack(powers)) < n:
@@ -51,19 +51,21 @@ class System(NamedTuple):
     @property
     def f(self) -> int:
         """(31)."""
-        return min(self.index, self.unstable)
+        return min(self.observability_index, self.unstable)
 
 
 def system(A, C, W=1.0, R=1.0, values: Sequence[complex] = ()) -> System | None:
     """With noise of variances ``W`` and ``R``, numbers or matrices; None without a filter."""
     A, C = np.atleast_2d(np.asarray(A, float)), np.atleast_2d(np.asarray(C, float))
-    W, R = (np.eye(k) * x if np.ndim(x) == 0 else x for k, x in ((len(A), W), (len(C), R)))
-    found = steady_state(A, C, W, R)
+    process, sensors = (
+        np.eye(k) * x if np.ndim(x) == 0 else np.asarray(x) for k, x in ((len(A), W), (len(C), R))
+    )
+    found = steady_state(A, C, process, sensors)
     if found.K is None or found.P is None or found.P_pred is None:
         return None
-    S = C @ found.P_pred @ C.T + R
+    S = C @ found.P_pred @ C.T + sensors
     known = tuple(values) or tuple(np.linalg.eigvals(A))
-    return System(A, C, found.K, S, found.P, found.P_pred, W, R, known)
+    return System(A, C, found.K, S, found.P, found.P_pred, process, sensors, known)
 
 
 def sure(A, C, W=1.0, R=1.0, values: Sequence[complex] = ()) -> System:
@@ -80,9 +82,9 @@ def rank(m: np.ndarray) -> int:
 
 
 def null(m: np.ndarray) -> np.ndarray:
-    """An orthonormal basis of the kernel, to 1e-8."""
+    """An orthonormal basis of the kernel, to 1e-8 in entries of order one."""
     _, sizes, right = np.linalg.svd(m)
-    count = int(np.sum(sizes > 1e-8 * max(float(np.max(sizes, initial=0.0)), 1e-300)))
+    count = int(np.sum(sizes > 1e-8 * max(float(np.max(sizes, initial=0.0)), 1.0)))
     return right[count:].conj().T
 
 
@@ -189,10 +191,10 @@ def theta(of: System, N: np.ndarray) -> np.ndarray:
 
 
 class Step(NamedTuple):
-    """A step of the recursion: F, N, and the whitened rows G that nobody alters."""
+    """A step of the recursion: F, a factor B of N, and the whitened rows G that nobody alters."""
 
     F: np.ndarray
-    N: np.ndarray
+    B: np.ndarray
     G: np.ndarray
 
 
@@ -200,23 +202,27 @@ def step(of: System, free: np.ndarray) -> Step:
     """For the outputs ``free`` (p,) that can be altered (erratum 10)."""
     E, told, p = np.eye(len(free))[:, free], of.C @ of.A, len(free)
     weight = np.linalg.solve(of.S, E)
-    left = E @ np.linalg.solve(E.T @ weight, np.hstack([weight.T, E.T]))
+    inner = np.linalg.cholesky(E.T @ weight)
+    spread = E @ np.linalg.inv(inner).T
+    F = of.A - of.K @ (np.eye(p) - spread @ spread.T @ np.linalg.inv(of.S)) @ told
     lower = np.linalg.cholesky(of.S[np.ix_(~free, ~free)])
-    F = of.A - of.K @ (np.eye(p) - left[:, :p]) @ told
-    return Step(F, of.K @ left[:, p:] @ of.K.T, np.linalg.solve(lower, told[~free]))
+    return Step(F, of.K @ spread, np.linalg.solve(lower, told[~free]))
 
 
 def forwards(steps: Sequence[Step]) -> np.ndarray:
-    """W_1 .. W_T of unit cost, each residue counted once."""
+    """W_1 .. W_T of unit cost, each residue counted once; by factors, as W spans many orders."""
     n = len(steps[0].F)
-    W, found = np.zeros((n, n)), []
-    for F, N, G in steps:
-        gain = np.linalg.solve(np.eye(len(G)) + G @ W @ G.T, G @ W).T
-        left = np.eye(n) - gain @ G
-        W = F @ (left @ W @ left.T + gain @ gain.T) @ F.T + N
-        W = (W + W.T) / 2
-        found.append(W)
+    L, found = np.zeros((n, n)), []
+    for F, B, G in steps:
+        if len(G):
+            L = np.linalg.solve(_triangle([G @ L, np.eye(n)]).T, L.T).T
+        L = _triangle([(F @ L).T, B.T, np.zeros((n, n))]).T
+        found.append(L @ L.T)
     return np.array(found)
+
+
+def _triangle(rows: list[np.ndarray]) -> np.ndarray:
+    return np.asarray(np.linalg.qr(np.vstack(rows), mode="r"))
 
 
 def ellipsoids(of: System, free: np.ndarray, horizon: np.ndarray, h: float) -> np.ndarray:
@@ -235,14 +241,14 @@ def ellipsoids(of: System, free: np.ndarray, horizon: np.ndarray, h: float) -> n
         if k <= len(horizon):
             Y = bound[t] * np.linalg.solve(np.eye(n) + W[k - 1] @ S, W[k - 1])
             found[k - 1] = (Y + Y.T) / 2
-        F, N, G = steps[k - 1]
-        S = F.T @ S @ np.linalg.solve(np.eye(n) + N @ S, F) + G.T @ G
+        F, B, G = steps[k - 1]
+        S = F.T @ S @ np.linalg.solve(np.eye(n) + B @ B.T @ S, F) + G.T @ G
         S = (S + S.T) / 2
     return found
 
 
 def alpha(t: np.ndarray, p: int, h: float, epsilon: float = EPSILON) -> np.ndarray:
-    """alpha(epsilon, tp, 2h + tp) of (47) at every t."""
+    """The bound of (47) at every t, the square root of what the sum up to t may come to."""
     t = np.asarray(t, float)
     return alphas(epsilon, t * p, 2.0 * h + t * p)
 

@@ -4,6 +4,7 @@ Q, R and h are unstated. Those of the errata are the ones with which the section
 together: variances 0.26984 and 10.144, h the quantile of the stated false-alarm rate.
 """
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -247,7 +248,7 @@ def for_ever(run: Run) -> Row:
 
 def algorithm_1(run: Run) -> Row:
     """Whether line 17 of Algorithm 1 is ever satisfied."""
-    grown = [shrinks(run.summed[L], L) for L in POLICIES]
+    grown = [growths(run.summed[L].shape[L - 1 :: L]) for L in POLICIES]
     least = [float(np.min(one)) for one in grown]
     count = len(run.summed[POLICIES[0]].norm) // POLICIES[0]
     return claim(
@@ -258,11 +259,10 @@ def algorithm_1(run: Run) -> Row:
     )  # fmt: skip
 
 
-def shrinks(found: Reach, every: int) -> np.ndarray:
-    """For each block after the first the least t with R_t in sqrt(t) R of the block before."""
-    ends = found.shape[every - 1 :: every]
-    return np.array([np.max(np.linalg.eigvals(np.linalg.solve(a, b)).real)
-                     for a, b in zip(ends, ends[1:], strict=False)])  # fmt: skip
+def growths(ends: np.ndarray) -> np.ndarray:
+    """For each set (t x n x n) but the first the least t with R in sqrt(t) R of the one before."""
+    pairs = pairwise(ends)
+    return np.array([np.max(np.linalg.eigvals(np.linalg.solve(a, b)).real) for a, b in pairs])
 
 
 def share() -> Row:

@@ -51,27 +51,41 @@ def reach(setting: Setting, steps: int, tight: bool = False) -> Reach:
 
 
 def _sums(setting: Setting, steps: int) -> Reach:
-    """The sum constraint at the horizon, exactly."""
-    horizon = setting.horizons(steps)
+    """The sum constraint at the horizon, exactly.
+
+    An attacker who does not know the policy has to meet it too, and has to be ready for a block
+    behind k: whatever he does, its residuals count. The tighter of the two.
+    """
+    horizon = setting.horizons(steps) - setting.blocks
     last = int(horizon[-1])
     m, index = setting.moves(last)
     told = m.ahead.reshape(-1, m.F.shape[1])
     m, ones = m._replace(ahead=m.ahead[:0]), np.ones((last, 1))
-    L = np.asarray(forward(m, index, ones, np.zeros(m.F.shape[1:])))[:steps]
+    ends = np.zeros(last, np.int32)
+    ends[horizon - 1] = 1
+    L = forward(m, index, ones, np.zeros(m.F.shape[1:]))[:steps]
+    found = _summed(setting, L, backward(m, index, ones, ends)[:steps], horizon)
     if setting.aware:
-        ends = np.zeros(last, np.int32)
-        ends[horizon - 1] = 1
-        T = np.asarray(backward(m, index, ones, ends))[:steps]
-    else:
-        # whatever he does, the residuals of a block that is authenticated from now on count
-        padded = np.vstack([told, np.zeros(m.F.shape[1:])])
-        T = np.tile(np.linalg.qr(padded, mode="r"), (steps, 1, 1))
+        return found
+    padded = np.vstack([told, np.zeros(m.F.shape[1:])])
+    T = np.tile(np.linalg.qr(padded, mode="r"), (steps, 1, 1))
+    ready = _summed(setting, L, T, found.k + setting.blocks)
+    less = ready.norm < found.norm
+    tighter = (
+        np.where(less.reshape(-1, *[1] * (x.ndim - 1)), x, y)
+        for x, y in zip(ready, found, strict=True)
+    )
+    return Reach(*tighter)
+
+
+def _summed(setting: Setting, L: np.ndarray, T: np.ndarray, horizon: np.ndarray) -> Reach:
+    """Y_k = alpha(t)^2 (W_k^-1 + S_k)^-1 of factors of W_k and S_k."""
     alpha = setting.stealth.alpha(horizon)
-    factors = np.asarray(joined(L, T)) * alpha[:, None, None]
+    factors = joined(L, T) * alpha[:, None, None]
     norm = np.linalg.norm(setting.functional @ factors, 2, axis=(1, 2))
     shape = factors @ np.swapaxes(factors, 1, 2)
-    exact = np.ones(steps, bool)
-    return Reach(np.arange(1, steps + 1), alpha, norm, norm, exact, shape, horizon)
+    exact = np.ones(len(L), bool)
+    return Reach(np.arange(1, len(L) + 1), alpha, norm, norm, exact, shape, horizon)
 
 
 def _each(setting: Setting, steps: int, tight: bool) -> Reach:
@@ -144,8 +158,8 @@ def _moved_on(share: np.ndarray | None, of: Long) -> np.ndarray | None:
 
 
 def _groups(setting: Setting, steps: int) -> Iterator[tuple[range, int]]:
-    """Runs of steps with one horizon."""
-    horizon = setting.horizons(steps) if setting.aware else np.arange(2, steps + 2)
+    """Runs of steps with one horizon; where a block may come at any time, with a step behind it."""
+    horizon = setting.horizons(steps) - max(0, setting.blocks - 1)
     cuts = np.flatnonzero(np.diff(horizon)) + 1
     for a, b in zip([0, *cuts], [*cuts, steps], strict=True):
         yield range(a + 1, b + 1), int(horizon[a])

@@ -11,8 +11,9 @@ from holdfast.reach.setting import Setting
 
 SHOWN = 15
 """Turns after which a bound of its own is computed for a step."""
-SLACK = 1e-4
-"""What the largest of several bounds may be above the largest one computed to the end."""
+SLACK, LONG_SLACK = 2e-4, 5e-3
+"""What the largest of several bounds may be above the largest one computed to the end: where the
+attacks can be written out, and over longer stretches."""
 
 
 class Piece(NamedTuple):
@@ -89,30 +90,29 @@ def highest(
     """The largest of the upper bounds at ``steps``, without computing all of them.
 
     Once one is known, of every other step it only has to be shown that its bound is no larger, or
-    larger by `SLACK` at most; what has been found for its neighbours is where that begins. Over
-    ``limit`` the first bound that is will do.
+    larger by `SLACK` at most. With a ``limit`` that is what has to be shown of all, and the first
+    step of which it is not true ends the search: the value is then a bound that is not tight.
     """
     of = stretch(setting, piece, tight)
     share = np.ones(len(of.b) + 1)
     places = np.array(steps) - piece.first - 1
     rough = sizes_of(setting, of, certificate(of, share))[places]
-    value, top = 0.0, steps[0]
-    for i in np.argsort(-rough):
-        if rough[i] <= value:
-            continue
-        enough = value * (1.0 + SLACK)
-        shown = descended(of, setting.functional, int(places[i]) + 1, share, enough, SHOWN)
-        rough = np.minimum(rough, sizes_of(setting, of, shown.held)[places])
+    value, slack = 0.0, SLACK if unknowns(of) <= MOST else LONG_SLACK
+    while True:
+        i = int(np.argmax(rough))
+        bar = limit if np.isfinite(limit) else value * (1.0 + slack)
+        if rough[i] <= bar:
+            return Highest(float(rough[i]), steps[i])
+        shown = descended(of, setting.functional, int(places[i]) + 1, share, bar, SHOWN)
         share = shown.held.share
-        if shown.upper <= enough:
-            value = max(value, shown.upper)
+        rough = np.minimum(rough, sizes_of(setting, of, shown.held)[places])
+        if rough[i] <= bar:
             continue
         own = bounds(setting, piece, of, steps[i], share)
-        if own is not None and own.upper > value:
-            value, top = own.upper, steps[i]
-        if value > limit:
-            break
-    return Highest(value, top)
+        rough[i] = 0.0 if own is None else min(rough[i], own.upper)
+        value = max(value, float(rough[i]))
+        if rough[i] > limit:
+            return Highest(float(rough[i]), steps[i])
 
 
 def sizes_of(setting: Setting, of: Long, held: Certificate) -> np.ndarray:

@@ -13,7 +13,7 @@ from holdfast.parts import InvalidValue
 from holdfast.reach.bounds import reach as reach_of
 from holdfast.reach.bounds import stretches
 from holdfast.reach.forever import forever, worst
-from holdfast.reach.pieces import highest
+from holdfast.reach.pieces import Piece, highest
 from holdfast.reach.setting import Setting
 from holdfast.records import Enforcement
 
@@ -64,6 +64,12 @@ def greatest(setting: Setting, steps: int | None, limit: float = math.inf) -> Re
             "none with the detector sprt, whose bound grows with the length of the sum",
             "a number of steps, or the detector chi_square or windowed",
         )
+    if math.isfinite(limit) and setting.after:
+        # before anything is proved for ever: whether the first blocks alone come too late
+        first = Piece(0, setting.after, None)
+        early = highest(setting, first, range(1, setting.after + 1), limit)
+        if early.value > limit:
+            return Reached(early.value, "period")
     found = forever(setting)
     top = worst(setting, found, limit)
     return Reached(math.inf if top is None else top.value, "period")
@@ -89,7 +95,7 @@ def policy(
     per_sensor: bool = False,
     told: Told = lambda text: None,
 ) -> Policy:
-    """The policy of least cost with |functional E e_k| <= ``limit`` at every k <= ``steps``, or ever.
+    """The policy of least cost with |functional E e_k| <= ``limit`` at every k (<= ``steps``).
 
     All outputs together, ``for`` steps in a row every ``every``, the first block at ``every``;
     ``for`` up to the smaller of observability index and unstable modes (Theorem 4). With
@@ -111,7 +117,9 @@ def policy(
     free = search.reached(None)
     if free.value <= limit:
         return search.found(None, free)
-    best = min((search.together(f) for f in search.durations()), key=_cost)
+    best = search.together(1)
+    for duration in search.durations()[1:]:
+        best = search.rarer(best, duration)
     if per_sensor:
         best = min(best, search.apart(best), key=_cost)
     return best
@@ -164,42 +172,60 @@ class _Search:
         return range(1, max(1, min(len(told) - 1, self.modes.unstable)) + 1)
 
     def together(self, duration: int) -> Policy:
-        """All outputs at once: the longest distance that does, by doubling and halving."""
+        """All outputs at once: the longest distance that does."""
+        return self._longest(self._global(duration), duration)
+
+    def rarer(self, best: Policy, duration: int) -> Policy:
+        """The same with blocks of ``duration``, where that is rarer than ``best``."""
+        held = best.enforcement
+        assert held is not None
+        every = int(held.every[0]) * duration // int(held.duration[0]) + 1
+        made = self._global(duration)
+        if every > MOST or self.reached(made(every)).value > self.limit:
+            return best
+        return min(best, self._longest(made, every), key=_cost)
+
+    def _global(self, duration: int) -> Callable[[int], Enforcement]:
         p = len(self.price)
-
-        def made(every: int) -> Enforcement:
-            return Enforcement.of([every] * p, duration, every)
-
-        return self._longest(made, duration)
+        return lambda every: Enforcement.of([every] * p, duration, every)
 
     def _longest(self, made: Callable[[int], Enforcement], shortest: int) -> Policy:
-        """The largest ``every`` for which ``made(every)`` does; ``shortest``, always on, does."""
+        """The largest ``every`` for which ``made(every)`` does; ``shortest`` is one that does.
 
-        def tried(every: int) -> Reached:
+        Where an answer costs next to nothing all are tried, from the longest down. Else by doubling
+        and halving, and a few beyond: what a longer distance allows is as good as always more.
+        """
+
+        def does(every: int) -> bool:
             self.told(f"every {every}")
-            return self.reached(made(every))
+            return self.reached(made(every)).value <= self.limit
 
-        good, value = shortest, Reached(0.0, "period" if self.steps is None else "horizon")
-        step, bad = 1, None
+        good, bad = shortest, None
+        if self.setting.stealth.detector == "sprt":
+            good = next((every for every in range(MOST, shortest, -1) if does(every)), shortest)
+            return self._tight(made(good))
+        step = 1
         while bad is None and good < MOST:
             every = min(MOST, good + step)
-            now = tried(every)
-            if now.value <= self.limit:
-                good, value, step = every, now, 2 * step
+            if does(every):
+                good, step = every, 2 * step
             else:
                 bad = every
         while bad is not None and bad - good > 1:
             middle = (good + bad) // 2
-            now = tried(middle)
-            if now.value <= self.limit:
-                good, value = middle, now
+            if does(middle):
+                good = middle
             else:
                 bad = middle
         for every in range(good + 2, min(good + 2 + BEYOND, MOST + 1)) if bad else ():
-            now = tried(every)
-            if now.value <= self.limit:
-                good, value = every, now
-        return self.found(made(good), value)
+            good = every if does(every) else good
+        return self._tight(made(good))
+
+    def _tight(self, enforcement: Enforcement) -> Policy:
+        """The record of a policy that does, with what it comes to and not only that it does."""
+        shown = self.reached(enforcement)
+        tight = greatest(self.setting._replace(enforcement=enforcement), self.steps)
+        return self.found(enforcement, min(shown, tight))
 
     def apart(self, together: Policy) -> Policy:
         """Each output its own schedule: which of those attacked, staggered over a common distance;
@@ -226,12 +252,10 @@ class _Search:
             first[chosen] = np.maximum(2, every - turn)
             return Enforcement.of([every] * p, lasting, first)
 
-        if self._always(made(duration)):
+        always = self.reached(made(duration))
+        if always.value <= self.limit:
             return self._longest(made, duration)
-        return self.found(made(duration), Reached(math.inf, ""))._replace(cost=math.inf)
-
-    def _always(self, enforcement: Enforcement) -> bool:
-        return self.reached(enforcement).value <= self.limit
+        return self.found(made(duration), always)._replace(cost=math.inf)
 
     def _slower(self, best: Policy) -> Policy:
         """One output after the other at a multiple of its distance, where that still does."""

@@ -79,20 +79,17 @@ class Setting(NamedTuple):
         that is both altered and authenticated has completed a block at or after k.
 
         Blocks of several outputs may follow each other closely: k then shares the t of the round
-        that it falls in. Without a policy, or for an attacker who does not know it: k, and what
-        he must be ready for behind it.
+        that it falls in. Without a policy: k. For an attacker who does not know the policy, the
+        end of the block that he must be ready for behind that t.
         """
-        k = np.arange(1, steps + 1)
-        if not self.aware:
-            return k + self.blocks
         ends = self._ends(steps)
         found = np.empty(steps, int)
         t = 0
-        for i in k:
-            if i > t:
-                t = ends(i)
-            found[i - 1] = t
-        return found
+        for i in range(steps):
+            if i >= t:
+                t = ends(i + 1)
+            found[i] = t
+        return found + self.blocks
 
     def _ends(self, steps: int):
         if self.enforced is not None:
