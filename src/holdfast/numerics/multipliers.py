@@ -73,21 +73,22 @@ def descended(
     k: int,
     share: np.ndarray | None = None,
     enough: float = 0.0,
+    over: float = np.inf,
     rounds: int = ROUNDS,
 ) -> Descended:
     """The multipliers that make the ellipsoid of e_k small, functional e_k being what counts.
 
     share_j <- share_j sqrt(spent_j / b_j), spent_j what the cheapest attack along the longest axis
     uses of limit j: it never makes that axis longer. Every turn gives an attack, once it has been
-    scaled to use no limit more than whole. From ``share`` on, until the upper bound is ``enough``
-    or the two meet.
+    scaled to use no limit more than whole. From ``share`` on, until the upper bound is ``enough``,
+    the lower one ``over`` what matters, or the two meet.
 
     Source: Silvey, Titterington and Torsney (1978); monotone by Yu (2010).
     """
     found = _turn(of, functional, k, np.ones(len(of.b) + 1) if share is None else share)
     last = found
     for _ in range(rounds - 1):
-        if found.upper <= max(enough, found.lower * (1.0 + CLOSE)):
+        if found.upper <= max(enough, found.lower * (1.0 + CLOSE)) or found.lower > over:
             break
         last = _turn(of, functional, k, _next_share(of, last))
         high, low = min(found, last, key=_upper), max(found, last, key=_lower)

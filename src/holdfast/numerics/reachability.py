@@ -154,8 +154,8 @@ def _still(m: Moves) -> Moves:
 
 
 def _length(t: int) -> int:
-    """The next of 16, 64, 256, 512, 1024, ..."""
-    return next((size for size in (16, 64, 256) if t <= size), 1 << (t - 1).bit_length())
+    """The next of 32, 128, 512, 1024, 2048, ..."""
+    return next((size for size in (32, 128) if t <= size), max(512, 1 << (t - 1).bit_length()))
 
 
 def _padded(m: Moves, index, *rows):

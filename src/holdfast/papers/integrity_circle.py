@@ -126,14 +126,12 @@ def drive(amount: Amount = Amount()) -> Run:  # noqa: B008
     plan, first = np.asarray(held.plan), int(held.first)
     bound = float(Stealth("chi_square", EPSILON, BETA, len(PLANT.outputs)).alpha(np.ones(1))[0])
     slow = steady(first, len(plan), start, bound)
-    under = eqx.tree_at(lambda w: w.attack.plan, free, jnp.asarray(slow))
-    cases = zip(
-        CASES, ((), (free,), (under,)), (None, None, policy()),
-        (np.zeros_like(plan), plan, slow), strict=True,
-    )  # fmt: skip
+    never = Enforcement.of([1] * len(PLANT.outputs), 0, 1)
+    plans = (np.zeros_like(plan), plan, slow)
     run = Run({}, {}, {}, {}, {}, first)
-    for name, attacks, enforcement, added in cases:
-        x, said, alarm = simulated(attacks, enforcement, system, amount.seeds, steps)
+    for name, added, enforcement in zip(CASES, plans, (never, never, policy()), strict=True):
+        attack = eqx.tree_at(lambda w: w.attack.plan, free, jnp.asarray(added))
+        x, said, alarm = simulated(attack, enforcement, system, amount.seeds, steps)
         e, z = shifted(system, added)
         run.deviation[name], run.error[name], run.alarm[name] = x, x - said, alarm
         run.shift[name] = np.vstack([np.zeros((first - 1, 4)), e])
@@ -142,9 +140,8 @@ def drive(amount: Amount = Amount()) -> Run:  # noqa: B008
 
 
 def simulated(
-    attacks: tuple[Attack, ...], enforcement: Enforcement | None, system: Watched,
-    seeds: int, steps: int,
-) -> tuple[np.ndarray, ...]:  # fmt: skip
+    attack: Attack, enforcement: Enforcement, system: Watched, seeds: int, steps: int
+) -> tuple[np.ndarray, ...]:
     """Deviation, its estimate and alarms, seeds first; the same noise whatever the attack."""
     n, m = len(PLANT.states), len(PLANT.inputs)
     steering = feedback.build(
@@ -153,7 +150,7 @@ def simulated(
     monitor = Monitor(
         kalman.build(PLANT, np.zeros(n), system.P), chi_square.build(PLANT, level=BETA)
     )
-    scenario = Scenario(PLANT, jnp.zeros(n), monitor, steering, attacks, enforcement)
+    scenario = Scenario(PLANT, jnp.zeros(n), monitor, steering, (attack,), enforcement)
     found = _simulated(scenario, jax.random.split(jax.random.key(0), seeds), steps)
     return tuple(map(np.asarray, found))
 

@@ -121,6 +121,16 @@ def _attack(of: System, z: np.ndarray) -> np.ndarray:
     return np.array(found)
 
 
+def calm(c: Sequence[float], p: int, h: float) -> float:
+    """The alarm rate of the weighted sum without attack."""
+    return weighted_noncentral_tail(h, np.asarray(c, float), p, np.zeros(len(c)))
+
+
+def last_alone(c: Sequence[float], p: int, h: float) -> float:
+    """The largest stealthy shift of the last step, the others being 0."""
+    return largest_shift(EPSILON, np.asarray(c, float), np.full(len(c), p), h, len(c) - 1)
+
+
 def under(c: Sequence[float], p: int, h: float, epsilon: float = EPSILON) -> float:
     """Lemma 1's bound as printed."""
     T = len(c)
@@ -141,7 +151,7 @@ def lemma_1(c: Sequence[float] = (0.0, 1.0), p: int = 1, h: float = 0.2) -> Row:
     """All shifts at the bound."""
     bound = under(c, p, h)
     rise = summed_rise(c, p, h, [bound] * len(c))
-    beta = weighted_noncentral_tail(h, c, p, np.zeros(len(c)))
+    beta = calm(c, p, h)
     return claim(
         "Lemma 1", "shifts within the lower alpha are stealthy, c = (0, 1), p = 1, h = 0.2: alpha, "
         "rise of the alarm probability at it, beta", [None, f"<= {EPSILON}", None],
@@ -206,7 +216,7 @@ def _threshold(c: Sequence[float], p: int, level: float) -> float:
     """The quantile of the weighted sum."""
 
     def off(h: float) -> float:
-        return weighted_noncentral_tail(h, c, p, np.zeros(len(c))) - level
+        return calm(c, p, h) - level
 
     return float(root_scalar(off, bracket=(1e-6, 200.0 * sum(c))).root)
 
@@ -235,8 +245,8 @@ def lemma_1_corrected(weights: Sequence = WEIGHTS, p: int = 2, off: float = 1.0)
 def lemma_2(c: Sequence[float] = (1.0, 1.0), p: int = 1, h: float = 1.0) -> Row:
     """The largest stealthy shift of one step against the printed bound."""
     bound = alpha_chi2(EPSILON, p, h / c[-1])
-    last = largest_shift(EPSILON, c, [p] * len(c), h, len(c) - 1)
-    beta = weighted_noncentral_tail(h, c, p, np.zeros(len(c)))
+    last = last_alone(c, p, h)
+    beta = calm(c, p, h)
     return claim(
         "Lemma 2", "stealthy shifts are within the upper alpha, c = (1, 1), p = 1, h = 1: alpha, "
         "a stealthy shift of one step alone, beta", [None, "<= alpha", None],
@@ -251,7 +261,7 @@ def lemma_2_levels(levels: Sequence[float] = LEVELS, bound: float = 0.1) -> Row:
     found = []
     for level in levels:
         h = float(chdtri(2, level))
-        found.append(largest_shift(EPSILON, [1, 1], [1, 1], h, 1) / alpha_chi2(EPSILON, 1, h))
+        found.append(last_alone((1.0, 1.0), 1, h) / alpha_chi2(EPSILON, 1, h))
     harmless = all(x <= 1.0 for x, level in zip(found, levels, strict=True) if level <= bound)
     return claim(
         "Lemma 2, by false-alarm rate", "c = (1, 1), p = 1 at beta = .65, .5, .3, .1, .01: largest "
@@ -265,7 +275,7 @@ def lemma_2_corrected(weights: Sequence = WEIGHTS, p: int = 2, off: float = 1.0)
     rng, most = default_rng(2), 0.0
     for c in weights:
         h = _threshold(c, p, 0.05)
-        bound = off * largest_shift(EPSILON, c, [p] * len(c), h, len(c) - 1)
+        bound = off * last_alone(c, p, h)
         for _ in range(5):
             others = 0.3 * bound * rng.uniform(0.0, 1.0, len(c) - 1)
 

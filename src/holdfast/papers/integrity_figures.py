@@ -10,11 +10,6 @@ from holdfast.papers import integrity_vehicle as vehicle
 from holdfast.papers.rows import Row, read_only, unstated
 from holdfast.reach.bounds import Reach
 
-ORDER = (
-    "Fig. 1", "Fig. 2", "Fig. 3", "Section V-B", "Section VI", "Section VI-A", "Fig. 4", "Fig. 5",
-    "Fig. 6", "Section VI-B", "Fig. 7", "Fig. 8",
-)  # fmt: skip
-"""The paper's own order, by what stands before the first comma of an id."""
 SHOWN = 10
 """Blocks of Fig. 5 that are drawn."""
 
@@ -51,13 +46,12 @@ def rows(amount: Amount = Amount()) -> list[Row]:  # noqa: B008
 
 def judged(run: Run) -> list[Row]:
     """The rows of a run."""
-    found = [
+    return [
         *unjudged(),
         *vehicle.judged(run.tracking),
         *circle.judged(run.turning),
         *dcacc.judged(run.following),
     ]
-    return sorted(found, key=lambda row: ORDER.index(row.id.split(", ")[0]))
 
 
 def unjudged() -> list[Row]:

@@ -103,11 +103,14 @@ def highest(
         bar = limit if np.isfinite(limit) else value * (1.0 + slack)
         if rough[i] <= bar:
             return Highest(float(rough[i]), steps[i])
-        shown = descended(of, setting.functional, int(places[i]) + 1, share, bar, SHOWN)
+        place = int(places[i]) + 1
+        shown = descended(of, setting.functional, place, share, bar, limit, SHOWN)
         share = shown.held.share
         rough = np.minimum(rough, sizes_of(setting, of, shown.held)[places])
         if rough[i] <= bar:
             continue
+        if shown.lower > limit and piece.start is None:
+            return Highest(float(rough[i]), steps[i])
         own = bounds(setting, piece, of, steps[i], share)
         rough[i] = 0.0 if own is None else min(rough[i], own.upper)
         value = max(value, float(rough[i]))

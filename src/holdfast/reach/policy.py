@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from holdfast.numerics.attackable import growth_of, movable
+from holdfast.numerics.steady_state import UNSTABLE
 from holdfast.numerics.subspaces import scaled, silent
 from holdfast.parts import InvalidValue
 from holdfast.reach.bounds import reach as reach_of
@@ -22,6 +23,9 @@ MOST = 400
 BEYOND = 3
 """Longer distances that are tried after one has failed: the error need not grow with it where the
 plant turns, and an even distance can see less than an odd one."""
+TURNED = 1e-9
+SMALL = 240
+"""Unknowns of a period up to which a policy's error is computed to the end."""
 MULTIPLES = (2, 3, 4)
 """Of the others' distance that a sensor of its own may have."""
 
@@ -64,12 +68,6 @@ def greatest(setting: Setting, steps: int | None, limit: float = math.inf) -> Re
             "none with the detector sprt, whose bound grows with the length of the sum",
             "a number of steps, or the detector chi_square or windowed",
         )
-    if math.isfinite(limit) and setting.after:
-        # before anything is proved for ever: whether the first blocks alone come too late
-        first = Piece(0, setting.after, None)
-        early = highest(setting, first, range(1, setting.after + 1), limit)
-        if early.value > limit:
-            return Reached(early.value, "period")
     found = forever(setting)
     top = worst(setting, found, limit)
     return Reached(math.inf if top is None else top.value, "period")
@@ -192,40 +190,44 @@ class _Search:
     def _longest(self, made: Callable[[int], Enforcement], shortest: int) -> Policy:
         """The largest ``every`` for which ``made(every)`` does; ``shortest`` is one that does.
 
-        Where an answer costs next to nothing all are tried, from the longest down. Else by doubling
-        and halving, and a few beyond: what a longer distance allows is as good as always more.
+        Where an answer costs next to nothing all are tried, from the longest down. Else by halving,
+        first on whether the first block comes in time at all; and a few beyond what has failed,
+        where the plant turns.
         """
 
         def does(every: int) -> bool:
             self.told(f"every {every}")
             return self.reached(made(every)).value <= self.limit
 
-        good, bad = shortest, None
         if self.setting.stealth.detector == "sprt":
-            good = next((every for every in range(MOST, shortest, -1) if does(every)), shortest)
-            return self._tight(made(good))
-        step = 1
-        while bad is None and good < MOST:
-            every = min(MOST, good + step)
-            if does(every):
-                good, step = every, 2 * step
-            else:
-                bad = every
-        while bad is not None and bad - good > 1:
-            middle = (good + bad) // 2
-            if does(middle):
-                good = middle
-            else:
-                bad = middle
-        for every in range(good + 2, min(good + 2 + BEYOND, MOST + 1)) if bad else ():
+            every = next((every for every in range(MOST, shortest, -1) if does(every)), shortest)
+            return self._tight(made(every))
+        top = _last(lambda every: self._early(made(every)), shortest, MOST)
+        good = _last(does, shortest, top)
+        for every in range(good + 2, min(good + 2 + BEYOND, MOST + 1)) if self._turns() else ():
             good = every if does(every) else good
         return self._tight(made(good))
 
+    def _early(self, enforcement: Enforcement) -> bool:
+        """Whether the limit holds up to the end of the first blocks: quick to say."""
+        asked = self.setting._replace(enforcement=enforcement)
+        last = asked.after
+        steps = range(1, min(last, self.steps or last) + 1)
+        return highest(asked, Piece(0, last, None), steps, self.limit).value <= self.limit
+
+    def _turns(self) -> bool:
+        """Whether a mode that does not fade changes its sign or turns."""
+        values = np.linalg.eigvals(self.setting.system.A)
+        lasting = values[np.abs(values) >= UNSTABLE]
+        return bool(np.any(np.abs(lasting - np.abs(lasting)) > TURNED * np.abs(lasting)))
+
     def _tight(self, enforcement: Enforcement) -> Policy:
         """The record of a policy that does, with what it comes to and not only that it does."""
+        asked = self.setting._replace(enforcement=enforcement)
         shown = self.reached(enforcement)
-        tight = greatest(self.setting._replace(enforcement=enforcement), self.steps)
-        return self.found(enforcement, min(shown, tight))
+        if int(np.max(enforcement.every)) * np.sum(asked.compromised) <= SMALL:
+            shown = min(shown, greatest(asked, self.steps))
+        return self.found(enforcement, shown)
 
     def apart(self, together: Policy) -> Policy:
         """Each output its own schedule: which of those attacked, staggered over a common distance;
@@ -273,3 +275,15 @@ class _Search:
                 better = self.found(now, reached)
                 best = min(best, better, key=_cost)
         return best
+
+
+def _last(does: Callable[[int], bool], low: int, high: int) -> int:
+    """The largest number up to ``high`` that does, if whatever is below one that does does too;
+    ``low`` does.
+    """
+    if low >= high or does(high):
+        return max(low, high)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if does(middle) else (low, middle)
+    return low
