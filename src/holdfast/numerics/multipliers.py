@@ -16,6 +16,8 @@ ROUNDS = 60
 """Times that the multipliers are improved; the bounds close in like one over it."""
 CLOSE = 1e-7
 LEAST = 1e-12
+RECENT, OLDEST = 0.25, 10
+"""Of the attacks so far, the share that the next multipliers go by; how many at most."""
 
 
 class Long(NamedTuple):
@@ -79,18 +81,22 @@ def descended(
     """The multipliers that make the ellipsoid of e_k small, functional e_k being what counts.
 
     share_j <- share_j sqrt(spent_j / b_j), spent_j what the cheapest attack along the longest axis
-    uses of limit j: it never makes that axis longer. Every turn gives an attack, once it has been
-    scaled to use no limit more than whole. From ``share`` on, until the upper bound is ``enough``,
-    the lower one ``over`` what matters, or the two meet.
+    uses of limit j: it never makes that axis longer. Another may become the longest: the best
+    ellipsoid often has several of one length, and going by one at a time would go to and fro
+    between them. So spent_j is a mean over the last attacks. Every turn gives an attack, once it
+    has been scaled to use no limit more than whole. From ``share`` on, until the upper bound is
+    ``enough``, the lower one ``over`` what matters, or the two meet.
 
-    Source: Silvey, Titterington and Torsney (1978); monotone by Yu (2010).
+    Source: Silvey, Titterington and Torsney (1978); monotone along one axis by Yu (2010).
     """
     found = _turn(of, functional, k, np.ones(len(of.b) + 1) if share is None else share)
-    last = found
-    for _ in range(rounds - 1):
+    last, mean = found, np.zeros(len(of.b) + 1)
+    for turn in range(rounds - 1):
         if found.upper <= max(enough, found.lower * (1.0 + CLOSE)) or found.lower > over:
             break
-        last = _turn(of, functional, k, _next_share(of, last))
+        new = min(1.0, 1.0 / min(RECENT * (turn + 1), OLDEST))
+        mean = (1.0 - new) * mean + new * _relative(of, last)
+        last = _turn(of, functional, k, last.held.share * np.sqrt(mean))
         high, low = min(found, last, key=_upper), max(found, last, key=_lower)
         found = Descended(high.upper, low.lower, high.held, low.path)
     return found
@@ -123,5 +129,8 @@ def _spent(of: Long, path: Path) -> np.ndarray:
     return np.append((of.w @ costs) / of.b, np.sum(path.first**2))
 
 
-def _next_share(of: Long, found: Descended) -> np.ndarray:
-    return found.held.share * np.sqrt(_spent(of, found.path))
+def _relative(of: Long, found: Descended) -> np.ndarray:
+    """What its attack uses of every limit, 1 on average over the shares."""
+    spent = _spent(of, found.path)
+    whole = float(found.held.share @ spent)
+    return spent / whole if whole > 0 else np.ones(len(spent))

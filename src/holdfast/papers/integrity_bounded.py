@@ -126,17 +126,12 @@ def equation_72(z: complex = 1.1 * np.exp(0.3j), size: int = 4, off: float = 0.0
     )  # fmt: skip
 
 
-def _outside(re: float, im: float) -> bool:
-    """An eigenvalue that is not one of the stable ones drawn."""
-    return bool(np.hypot(re, im) > 0.9)
-
-
 def theorem_5(count: int = 200, seed: int = 21, less: int = 0) -> Row:
     """What O_f A leaves of the unstable subspace."""
     lost = wanted = 0
     for of in drawn(count, seed):
         if of.unstable:
-            _, basis, *number = schur(of.A, output="real", sort=_outside)
+            _, basis, *number = schur(of.A, output="real", sort=lambda re, im: re**2 + im**2 > 0.8)
             q = int(number[0])
             powers = [of.C @ np.linalg.matrix_power(of.A, k + 1) for k in range(of.f - less)]
             seen = rank(np.vstack(powers) @ basis[:, :q]) if powers else 0

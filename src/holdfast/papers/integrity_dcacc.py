@@ -44,11 +44,12 @@ class Amount(NamedTuple):
 
 
 class Run(NamedTuple):
-    """Under the sum with L = 20 (``held``), with twenty free samples between blocks of two
+    """The ``plant``; under the sum with L = 20 (``held``), with twenty free samples between blocks of two
     (``spaced``), and without enforcement (``free``); ``ever``: what L = 20 bounds for ever under
     a test of every step; ``noise``: (sensor, maneuver) variances that bring it to the limit.
     """
 
+    plant: LinearPlant
     held: Reach
     spaced: Reach
     free: Reach
@@ -79,6 +80,7 @@ def drive(amount: Amount = Amount()) -> Run:  # noqa: B008
     steps = EVERY * amount.blocks
     per_step = asked(plant, "chi_square", policy())
     return Run(
+        plant,
         reach(asked(plant, "sprt", policy()), steps),
         reach(asked(plant, "sprt", SPACED), steps),
         reach(asked(plant, "sprt", None), amount.steps),
@@ -113,8 +115,8 @@ def rows(amount: Amount = Amount()) -> list[Row]:  # noqa: B008
 def judged(run: Run) -> list[Row]:
     """The rows of a run."""
     return [
-        structure(),
-        attackable(),
+        structure(run.plant),
+        attackable(run.plant),
         limit(),
         noise(run),
         figure_7(run),
@@ -128,9 +130,9 @@ def judged(run: Run) -> list[Row]:
     ]
 
 
-def structure() -> Row:
+def structure(plant: LinearPlant) -> Row:
     """The observability index and the unstable modes."""
-    found = observability(model_at(dcacc.build(), np.zeros(3)))
+    found = observability(model_at(plant, np.zeros(3)))
     ours = [found.rows, found.unstable, min(found.rows or 3, found.unstable)]
     return claim(
         "Section VI-B", "observability index 2, two unstable eigenvalues, so f = 2",
@@ -139,9 +141,8 @@ def structure() -> Row:
     )  # fmt: skip
 
 
-def attackable() -> Row:
+def attackable(plant: LinearPlant) -> Row:
     """Perfectly attackable without enforcement, bounded with it."""
-    plant = dcacc.build()
     without, once, with_ = (
         forever(asked(plant, "chi_square", e)).bounded
         for e in (None, Enforcement.of([EVERY] * 2, 1, EVERY), policy())

@@ -38,7 +38,7 @@ class System(NamedTuple):
     @property
     def unstable(self) -> int:
         """q_un, counted with multiplicity."""
-        return sum(abs(z) >= 1.0 for z in self.values)
+        return sum(bool(abs(z) >= 1.0 - 1e-9) for z in self.values)
 
     @property
     def observability_index(self) -> int:

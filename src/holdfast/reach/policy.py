@@ -26,6 +26,8 @@ plant turns, and an even distance can see less than an odd one."""
 TURNED = 1e-9
 SMALL = 240
 """Unknowns of a period up to which a policy's error is computed to the end."""
+SCALES = (0.3, 0.5, 0.7, 0.85, 1.0, 1.25, 1.6, 2.0, 3.0)
+"""Of a policy's distances, for the trade-off."""
 MULTIPLES = (2, 3, 4)
 """Of the others' distance that a sensor of its own may have."""
 
@@ -121,6 +123,30 @@ def policy(
     if per_sensor:
         best = min(best, search.apart(best), key=_cost)
     return best
+
+
+def trade_off(
+    setting: Setting, best: Policy, steps: int | None, costs: Sequence[float] | None = None
+) -> list[Policy]:
+    """Error against share: the policy's distances between blocks scaled down and up."""
+    held = best.enforcement
+    if held is None:
+        return [best]
+    p = len(setting.compromised)
+    price = np.ones(p) if costs is None else np.asarray(costs, float)
+    search = _Search(setting, math.inf, steps, price, lambda text: None)
+    found, seen = [], set()
+    for scale in SCALES:
+        every = np.maximum(held.duration, np.rint(scale * np.asarray(held.every))).astype(int)
+        if tuple(every) in seen:
+            continue
+        seen.add(tuple(every))
+        first = np.maximum(2, np.rint(scale * np.asarray(held.first))).astype(int)
+        made = Enforcement.of(every, held.duration, first)
+        reached = search.reached(made)
+        if math.isfinite(reached.value):
+            found.append(search.found(made, reached)._replace(limit=best.limit))
+    return found
 
 
 def _cost(found: Policy) -> float:

@@ -2,7 +2,7 @@
 
 import sys
 import warnings
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -92,6 +92,131 @@ def analyse(
     from holdfast.shell import analysing
 
     analysing.analyse(scenario, compromised, as_json, allow_python)
+
+
+Compromised = Annotated[
+    str | None,
+    typer.Option(
+        "--compromised", help="Outputs that the attacker alters: A,B or all.", show_default=False
+    ),
+]
+DetectorName = Annotated[
+    Literal["chi_square", "windowed", "sprt"],
+    typer.Option("--detector", help="The test that the attacker must not raise."),
+]
+Epsilon = Annotated[
+    float, typer.Option("--epsilon", help="By how much he may raise its alarm probability.")
+]
+Level = Annotated[
+    float | None,
+    typer.Option(
+        "--level", help="False-alarm probability; default the scenario's.", show_default=False
+    ),
+]
+Length = Annotated[
+    int | None,
+    typer.Option(
+        "--length", min=1, help="Rows of a windowed test; default the scenario's, or 10.",
+        show_default=False,
+    ),
+]  # fmt: skip
+Functional = Annotated[
+    str | None,
+    typer.Option(
+        "--functional", help="CSV matrix whose image of the error counts. Default: all of it.",
+        show_default=False,
+    ),
+]  # fmt: skip
+Unaware = Annotated[
+    bool, typer.Option("--unaware", help="The attacker does not know when messages are checked.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="JSON to standard output, and nothing else.")]
+Folder = Annotated[
+    str | None,
+    typer.Option("-o", help="Folder for the JSON and a picture.", show_default=False),
+]
+
+
+@app.command()
+def reach(
+    scenario: ScenarioArgument,
+    steps: Annotated[int, typer.Option("--steps", min=1, max=10**6, help="How many steps.")],
+    compromised: Compromised = None,
+    enforce: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--enforce",
+            help="every=L,for=F,first=K: authenticated steps; NAME:every=.. for one output, "
+            "repeatable. Default: the scenario's.",
+            show_default=False,
+        ),
+    ] = None,
+    detector: DetectorName = "chi_square",
+    epsilon: Epsilon = 0.001,
+    level: Level = None,
+    length: Length = None,
+    gamma: Annotated[
+        float, typer.Option("--gamma", help="Times the covariance, added to the ellipsoids.")
+    ] = 0.0,
+    functional: Functional = None,
+    unaware: Unaware = False,
+    tight: Annotated[
+        bool, typer.Option("--tight", help="sprt: bound the sums at every step (few steps).")
+    ] = False,
+    as_json: AsJson = False,
+    output: Folder = None,
+    allow_python: AllowPython = False,
+) -> None:
+    """Say how far a stealthy attacker can move the estimate, step by step."""
+    from holdfast.shell import reaching
+
+    asked = reaching.Asked(
+        compromised, detector, epsilon, level, length, functional, unaware, as_json, output,
+        allow_python,
+    )  # fmt: skip
+    reaching.run_reach(scenario, asked, enforce or [], steps, gamma, tight)
+
+
+@app.command()
+def policy(
+    scenario: ScenarioArgument,
+    limit: Annotated[float, typer.Option("--limit", help="What the error must stay under.")],
+    compromised: Compromised = None,
+    steps: Annotated[
+        int | None,
+        typer.Option(
+            "--steps", min=1, max=10**6, help="Over so many steps. Default: for ever.",
+            show_default=False,
+        ),
+    ] = None,
+    per_sensor: Annotated[
+        bool, typer.Option("--per-sensor", help="Let every output have a schedule of its own.")
+    ] = False,
+    cost: Annotated[
+        str | None,
+        typer.Option(
+            "--cost", help="NAME=NUMBER,..: what a message costs; 1 unless named.",
+            show_default=False,
+        ),
+    ] = None,
+    detector: DetectorName = "chi_square",
+    epsilon: Epsilon = 0.001,
+    level: Level = None,
+    length: Length = None,
+    functional: Functional = None,
+    unaware: Unaware = False,
+    as_json: AsJson = False,
+    output: Folder = None,
+    allow_python: AllowPython = False,
+) -> None:  # fmt: skip
+    """Find the rarest authentication that keeps that error under a limit."""
+    from holdfast.shell import reaching
+
+    asked = reaching.Asked(
+        compromised, detector, epsilon, level, length, functional, unaware, as_json, output,
+        allow_python,
+    )  # fmt: skip
+    reaching.run_policy(scenario, asked, limit, steps, per_sensor, cost)
 
 
 @app.command()

@@ -6,7 +6,7 @@ from pydantic import Field
 
 from holdfast.parts import Plant
 from holdfast.records import Enforcement
-from holdfast.shell.errors import one_of
+from holdfast.shell.errors import InputError, one_of, shown
 from holdfast.shell.schema import Strict, Table
 
 WHOLE = "a whole number from 1 up"
@@ -54,3 +54,51 @@ def enforcement_of(table: Table, plant: Plant) -> Enforcement:
 
 def _numbers(keys: Any) -> tuple[int, int, int]:
     return keys.every, keys.duration, keys.every if keys.first is None else keys.first
+
+
+FLAG = "--enforce"
+WANTED = "every=L,for=F,first=K (for and first may be left out), or NAME:every=L,.."
+
+
+def enforcement_flags(flags: list[str], outputs: tuple[str, ...]) -> Enforcement:
+    """Of ``every=L,for=F,first=K`` for all outputs, and of ``NAME:every=..`` for one.
+
+    As in the table: for is 1 and first is every unless given, and with names alone the other
+    outputs are never authenticated. Raises `InputError`.
+    """
+    common: dict[str, int] | None = None
+    named: dict[str, dict[str, int]] = {}
+    for flag in flags:
+        name, colon, keys = flag.rpartition(":")
+        if not colon:
+            if common is not None:
+                raise InputError(FLAG, "", f"two of all outputs: {shown(flag)}", WANTED)
+            common = _numbers_of(keys, flag)
+        elif name not in outputs:
+            raise InputError(FLAG, "", f"{shown(name)}", one_of(outputs, name))
+        elif name in named:
+            raise InputError(FLAG, "", f"{shown(name)} twice", "every output once")
+        else:
+            named[name] = _numbers_of(keys, flag)
+    rows = []
+    for name in outputs:
+        keys = named.get(name, common)
+        if keys is None:
+            rows.append(NEVER)
+        else:
+            rows.append((keys["every"], keys.get("for", 1), keys.get("first", keys["every"])))
+    return Enforcement.of(*([row[i] for row in rows] for i in range(3)))
+
+
+def _numbers_of(text: str, flag: str) -> dict[str, int]:
+    found: dict[str, int] = {}
+    for part in text.split(","):
+        key, _, value = (piece.strip() for piece in part.partition("="))
+        if key not in ("every", "for", "first") or key in found:
+            raise InputError(FLAG, "", shown(flag), WANTED)
+        if not (value.isascii() and value.isdigit() and 1 <= int(value[:11]) < 2**31):
+            raise InputError(FLAG, "", f"{shown(part)} in {shown(flag)}", f"{key}: {WHOLE}")
+        found[key] = int(value)
+    if "every" not in found:
+        raise InputError(FLAG, "", shown(flag), WANTED)
+    return found
