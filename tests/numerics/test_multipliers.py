@@ -61,8 +61,8 @@ def closes(setting, of, k, rounds):
         played(setting, of, found.path, k, found.lower)
     assert few.upper >= many.upper
     # like one over the rounds
-    assert many.upper <= truth.upper * (1 + 4.0 / rounds)
-    assert many.lower >= truth.lower * (1 - 4.0 / rounds)
+    assert many.upper <= truth.upper * (1 + 8.0 / rounds)
+    assert many.lower >= truth.lower * (1 - 8.0 / rounds)
 
 
 def played(setting, of, path, k, value):

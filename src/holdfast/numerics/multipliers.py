@@ -8,6 +8,7 @@ algorithm needs no more than what the cheapest attack spends on each limit.
 from typing import NamedTuple
 
 import numpy as np
+from numpy.linalg import norm
 from scipy.sparse import csr_array
 
 from holdfast.numerics.reachability import Moves, Path, backward, forward, joined, longest
@@ -16,8 +17,8 @@ ROUNDS = 60
 """Times that the multipliers are improved; the bounds close in like one over it."""
 CLOSE = 1e-7
 LEAST = 1e-12
-RECENT, OLDEST = 0.25, 10
-"""Of the attacks so far, the share that the next multipliers go by; how many at most."""
+TURNED, OLDEST = 0.9, 10
+"""Cosine of two longest axes that are not the same; attacks that the multipliers go by at most."""
 
 
 class Long(NamedTuple):
@@ -83,20 +84,22 @@ def descended(
     share_j <- share_j sqrt(spent_j / b_j), spent_j what the cheapest attack along the longest axis
     uses of limit j: it never makes that axis longer. Another may become the longest: the best
     ellipsoid often has several of one length, and going by one at a time would go to and fro
-    between them. So spent_j is a mean over the last attacks. Every turn gives an attack, once it
-    has been scaled to use no limit more than whole. From ``share`` on, until the upper bound is
-    ``enough``, the lower one ``over`` what matters, or the two meet.
+    between them for ever. So where the axis changes spent_j is a mean over the last attacks. Every
+    turn gives an attack, once it has been scaled to use no limit more than whole. From ``share``
+    on, until the upper bound is ``enough``, the lower one ``over`` what matters, or the two meet.
 
     Source: Silvey, Titterington and Torsney (1978); monotone along one axis by Yu (2010).
     """
     found = _turn(of, functional, k, np.ones(len(of.b) + 1) if share is None else share)
-    last, mean = found, np.zeros(len(of.b) + 1)
-    for turn in range(rounds - 1):
+    last, mean, changes = found, _relative(of, found), 0
+    for _ in range(rounds - 1):
         if found.upper <= max(enough, found.lower * (1.0 + CLOSE)) or found.lower > over:
             break
-        new = min(1.0, 1.0 / min(RECENT * (turn + 1), OLDEST))
-        mean = (1.0 - new) * mean + new * _relative(of, last)
+        before = functional @ last.path.e[k - 1]
         last = _turn(of, functional, k, last.held.share * np.sqrt(mean))
+        changes += abs(before @ functional @ last.path.e[k - 1]) < TURNED * last.lower * norm(before)
+        new = max(1.0 / OLDEST, 1.0 / (1.0 + 0.5 * changes))
+        mean = (1.0 - new) * mean + new * _relative(of, last)
         high, low = min(found, last, key=_upper), max(found, last, key=_lower)
         found = Descended(high.upper, low.lower, high.held, low.path)
     return found
@@ -119,7 +122,7 @@ def _turn(of: Long, functional: np.ndarray, k: int, share: np.ndarray) -> Descen
     most = float(np.max(_spent(of, path)))
     scale = 1.0 / np.sqrt(most) if most > 0 else 0.0
     path = Path(path.e * scale, path.a * scale, path.cost * scale**2, path.first * scale)
-    reached = float(np.linalg.norm(functional @ path.e[k - 1]))
+    reached = float(norm(functional @ path.e[k - 1]))
     return Descended(size, reached, held, path)
 
 

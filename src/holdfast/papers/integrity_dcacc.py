@@ -44,9 +44,9 @@ class Amount(NamedTuple):
 
 
 class Run(NamedTuple):
-    """The ``plant``; under the sum with L = 20 (``held``), with twenty free samples between blocks of two
-    (``spaced``), and without enforcement (``free``); ``ever``: what L = 20 bounds for ever under
-    a test of every step; ``noise``: (sensor, maneuver) variances that bring it to the limit.
+    """The ``plant``; under the sum with L = 20 (``held``), with twenty free samples between blocks
+    of two (``spaced``), and without enforcement (``free``); ``ever``: what L = 20 bounds for ever
+    under a test of every step; ``noise``: (sensor, maneuver) variances that bring it to the limit.
     """
 
     plant: LinearPlant

@@ -231,7 +231,7 @@ def lemma_1_corrected(weights: Sequence = WEIGHTS, p: int = 2, off: float = 1.0)
             return summed_rise(c, p, h, [a] * len(c)) / EPSILON - 1.0
 
         bound = off * float(root_scalar(gap, bracket=(1e-3, 20.0)).root)
-        for _ in range(5):
+        for _ in range(2):
             shifts = bound * rng.uniform(0.0, 1.0, len(c))
             most = max(most, summed_rise(c, p, h, shifts) / EPSILON)
         most = max(most, summed_rise(c, p, h, [bound] * len(c)) / EPSILON)
@@ -276,14 +276,14 @@ def lemma_2_corrected(weights: Sequence = WEIGHTS, p: int = 2, off: float = 1.0)
     for c in weights:
         h = _threshold(c, p, 0.05)
         bound = off * last_alone(c, p, h)
-        for _ in range(5):
+        for _ in range(2):
             others = 0.3 * bound * rng.uniform(0.0, 1.0, len(c) - 1)
 
             def gap(s: float, c=c, h=h, others=others) -> float:
                 return summed_rise(c, p, h, [*others, s]) / EPSILON - 1.0
 
             if gap(0.0) < 0.0:
-                last = float(root_scalar(gap, bracket=(0.0, 50.0)).root)
+                last = float(root_scalar(gap, bracket=(0.0, 50.0), xtol=1e-9).root)
                 most = max(most, last / bound)
     return claim(
         "Lemma 2, corrected", "alpha of the last step alone by the sum's own distribution: largest "

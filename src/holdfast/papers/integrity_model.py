@@ -7,7 +7,7 @@ from numpy.random import default_rng
 from scipy.linalg import solve_discrete_lyapunov
 from scipy.special import chdtrc, ndtr
 
-from holdfast.numerics.noncentral import alpha_chi2, alphas
+from holdfast.numerics.noncentral import alphas
 from holdfast.numerics.quadratic_reach import largest
 from holdfast.papers.integrity_detection import risen
 from holdfast.papers.integrity_systems import (
@@ -182,7 +182,7 @@ def remark_3(h: float = 9.0, p: int = 1, grows: bool = False, last: int = 200) -
         risen(k * each**2, k * p, x) / EPSILON
         for k, x in zip(steps.tolist(), thresholds.tolist(), strict=True)
     ]
-    single = [alpha_chi2(EPSILON, p, float(x)) for x in thresholds]
+    single = alphas(EPSILON, np.full(len(steps), p), thresholds)
     beyond = float(np.max(alpha / single))
     most = float(np.max(rises))
     id = "Remark 3, threshold 2h + kp" if grows else "Remark 3"

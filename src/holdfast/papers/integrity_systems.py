@@ -212,17 +212,15 @@ def step(of: System, free: np.ndarray) -> Step:
 def forwards(steps: Sequence[Step]) -> np.ndarray:
     """W_1 .. W_T of unit cost, each residue counted once; by factors, as W spans many orders."""
     n = len(steps[0].F)
-    L, found = np.zeros((n, n)), []
+    L = none = np.zeros((n, n))
+    eye, found = np.eye(n), []
     for F, B, G in steps:
         if len(G):
-            L = np.linalg.solve(_triangle([G @ L, np.eye(n)]).T, L.T).T
-        L = _triangle([(F @ L).T, B.T, np.zeros((n, n))]).T
+            R = np.asarray(np.linalg.qr(np.vstack([G @ L, eye]), mode="r"))
+            L = np.linalg.solve(R.T, L.T).T
+        L = np.asarray(np.linalg.qr(np.vstack([(F @ L).T, B.T, none]), mode="r")).T
         found.append(L @ L.T)
     return np.array(found)
-
-
-def _triangle(rows: list[np.ndarray]) -> np.ndarray:
-    return np.asarray(np.linalg.qr(np.vstack(rows), mode="r"))
 
 
 def ellipsoids(of: System, free: np.ndarray, horizon: np.ndarray, h: float) -> np.ndarray:

@@ -22,7 +22,7 @@ MARGINS = (1.0 + 1e-6, 1.0 + 1e-4, 1.0 + 1e-3)
 """What the set is enlarged by so that it is not below its limit."""
 ROUGH = 1e-3
 """Relative change of a set's size that is not worth another round."""
-FEW = 12
+FEW = 6
 """Turns of the multipliers where only a choice hangs on them."""
 PARTS = np.geomspace(1e-3, 0.3, 5)
 """What a step may take of a certificate, tried one after the other."""
@@ -199,7 +199,8 @@ def _held(setting: Setting, kept: np.ndarray) -> float:
     if unknowns(of) == 0:
         return 1.0
     unit = _units(kept)
-    return max(1.0, descended(of, np.linalg.pinv(kept / unit) / unit.T, after).upper)
+    goal = np.linalg.pinv(kept / unit) / unit.T
+    return max(1.0, descended(of, goal, after, enough=1.0).upper)
 
 
 def worst(setting: Setting, found: Forever, limit: float = math.inf) -> Highest | None:

@@ -111,11 +111,18 @@ def highest(
             continue
         if shown.lower > limit and piece.start is None:
             return Highest(float(rough[i]), steps[i])
-        own = bounds(setting, piece, of, steps[i], share)
-        rough[i] = 0.0 if own is None else min(rough[i], own.upper)
+        rough[i] = min(rough[i], _above(setting, piece, of, steps[i], share, bar))
         value = max(value, float(rough[i]))
         if rough[i] > limit:
             return Highest(float(rough[i]), steps[i])
+
+
+def _above(setting, piece: Piece, of: Long, k: int, share: np.ndarray, bar: float) -> float:
+    """The upper bound at k, computed to the end or until it is under ``bar``."""
+    if small(of):
+        both = bounds(setting, piece, of, k)
+        return 0.0 if both is None else both.upper
+    return descended(of, setting.functional, k - piece.first, share, bar).upper
 
 
 def sizes_of(setting: Setting, of: Long, held: Certificate) -> np.ndarray:

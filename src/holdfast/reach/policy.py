@@ -160,17 +160,20 @@ class _Search:
         self.setting, self.limit, self.steps, self.price, self.told = (
             setting, limit, steps, price, told,
         )  # fmt: skip
-        self.tried = 0
+        self.known: dict[tuple, Reached] = {}
         s = setting.system
         self.modes = movable(s.A, s.C, s.K)
 
     def reached(self, enforcement: Enforcement | None) -> Reached:
-        """What the attacker reaches under a policy."""
-        self.tried += 1
-        asked = self.setting._replace(enforcement=enforcement)
-        if self.steps is None and not self._bounded(asked):
-            return Reached(math.inf, "period")
-        return greatest(asked, self.steps, self.limit)
+        """What the attacker reaches under a policy: whether it is under the limit, at least."""
+        key = () if enforcement is None else _key(enforcement)
+        if key not in self.known:
+            asked = self.setting._replace(enforcement=enforcement)
+            if self.steps is None and not self._bounded(asked):
+                self.known[key] = Reached(math.inf, "period")
+            else:
+                self.known[key] = greatest(asked, self.steps, self.limit)
+        return self.known[key]
 
     def _bounded(self, asked: Setting) -> bool:
         """Cheap, and exact: whether there is a bound at all."""
@@ -185,7 +188,7 @@ class _Search:
         cost = float(shares @ self.price)
         return Policy(
             enforcement, reached.value, self.limit, float(np.mean(shares)), cost, self.steps,
-            reached.proof, self.tried,
+            reached.proof, len(self.known),
         )  # fmt: skip
 
     def durations(self) -> range:
@@ -301,6 +304,10 @@ class _Search:
                 better = self.found(now, reached)
                 best = min(best, better, key=_cost)
         return best
+
+
+def _key(held: Enforcement) -> tuple:
+    return tuple(np.concatenate([held.every, held.duration, held.first]).tolist())
 
 
 def _last(does: Callable[[int], bool], low: int, high: int) -> int:
