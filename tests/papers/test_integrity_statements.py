@@ -137,7 +137,7 @@ TURNED = {
     "Definition 4, t^i_(k+1)": lambda: attackable.definition_4(of=bounded.IDENTITY),
     "Definition 4, t^i_k + 1": lambda: attackable.definition_4(True, f=1),
     "Remark 4": lambda: attackable.remark_4(late=1),
-    "Theorem 4": lambda: attackable.theorem_4(FEW, less=1),
+    "Theorem 4": lambda: attackable.theorem_4(6, less=1),
     "Theorem 4, with the sum of (46)": lambda: sprt.theorem_4((3, 4)),
     "Theorem 4, f - 1": lambda: attackable.theorem_4_less(FEW, less=0),
     "Theorem 4, distinct eigenvalues": lambda: attackable.theorem_4_less(

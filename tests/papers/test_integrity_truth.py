@@ -81,7 +81,7 @@ def test_what_wald_s_test_lets_pass_by_simulation():
     for moved in (0.0, shift):
         g, alarms = np.zeros(2000), 0
         for _ in range(1000):
-            z = rng.normal(size=(2000, 2)) + [moved, 0.0]
+            z = rng.normal(size=(2000, 2)) + np.array([moved, 0.0])
             g += 0.5 * np.sum(z**2, 1) - 1.0
             alarms += np.sum(g > 4.2)
             g[(g > 4.2) | (g < -4.2)] = 0.0
@@ -135,7 +135,7 @@ def run(A, C, K, attacks):
 def test_a_repeated_eigenvalue_is_attacked_along_a_combination():
     """A = 1.1 I, C = [1 1; 1 0], sensor 2 alone: the error grows, the residues stay small."""
     A, C = np.diag([1.1, 1.1]), np.array([[1.0, 1.0], [1.0, 0.0]])
-    K, S, _ = steady(A, C, np.eye(2), np.eye(2))
+    K, _, _ = steady(A, C, np.eye(2), np.eye(2))
     # a_2 keeps the residue at (r, 1) with r what sensor 1 says, which he cannot touch
     errors, residues = run(A, C, K, [lambda e: np.array([0.0, 1.0 - 1.1 * e[0]])] * 150)
     assert np.max(residues) < 3.0
@@ -153,18 +153,14 @@ def test_a_rotation_is_attacked_between_single_authenticated_steps():
     K, _, _ = steady(A, C, np.eye(2), np.eye(1))
 
     def attack(k):
-        # at k = 2 mod 4 push x_1, which is x_2 at the authenticated k = 3 and unseen there
-        want = {0: 1.0, 2: -1.0}.get(k % 4, 0.0)
-        return lambda e: np.array([want - (C @ A @ e)[0]])
+        # the error is on x_1 after odd steps and on x_2 after the others: pushes along x_1 at odd
+        # steps, in the error's own sign, show nothing at the step 0 mod 4, where x_2 is 0 before
+        want = {1: 1.0, 3: -1.0}.get(k % 4, 0.0)
+        return lambda e: np.array([want - (C @ A @ e)[0]]) if k % 4 else np.zeros(1)
 
-    for first in range(4):
-        hidden = [(lambda e: np.zeros(1)) if k % 4 == first else attack(k) for k in range(400)]
-        errors, residues = run(A, C, K, hidden)
-        if np.max(residues) <= 1.0 + 1e-6:
-            assert errors[-1] > 0.2 * 400 * np.linalg.norm(K)
-            break
-    else:
-        pytest.fail("no phase hides the attack")
+    errors, residues = run(A, C, K, [attack(k) for k in range(400)])
+    assert np.max(residues) < 1.0 + 1e-9
+    assert errors[-1] == pytest.approx(200 * K[0, 0], rel=1e-9)
     grows, also, other, both = attackable.theorem_4_rotation().ours
     assert min(grows, also) > 15.0
     assert max(other, both) < 3.0
@@ -208,6 +204,11 @@ def dense(A, C, K, S, free):
             e = A @ e - K @ z
             E[k, :, column], Z[k, :, column] = e, half @ z
     return E, Z
+
+
+def largest(e, told, bound):
+    """The largest norm of e theta over theta' told theta <= bound^2."""
+    return bound * np.sqrt(np.linalg.norm(e @ np.linalg.solve(told, e.T), 2))
 
 
 def test_the_algorithm_stops_too_early():
@@ -290,13 +291,10 @@ def test_errors_do_not_grow_with_the_distance_of_blocks():
         told = np.einsum("tpi,tpj->ij", Z, Z)
         bound = alpha(t, 8.4 + t)
         first = t - L
-        worst[L] = max(
-            bound * np.sqrt(np.linalg.norm(e @ np.linalg.solve(told, e.T), 2)) for e in E[first:]
-        )
+        worst[L] = max(largest(e, told, bound) for e in E[first:])
         own = under(of, Policy(2, L), blocks, 4.2)[first:]
-        assert worst[L] == pytest.approx(
-            np.sqrt(np.linalg.norm(own, 2, axis=(1, 2)).max()), rel=1e-6
-        )
+        sizes = np.sqrt(np.linalg.norm(own, 2, axis=(1, 2)))
+        assert worst[L] == pytest.approx(np.max(sizes), rel=1e-6)
     assert worst[10] > 1.1 * worst[14]
     assert algorithm.largest_L().ours == [9, 18]
 
@@ -321,7 +319,7 @@ def test_the_dense_form_is_lost_where_a_is_unstable():
     """Theta of A = 1.2 in exact arithmetic: its condition grows like A^2k."""
     errors = regions.dense().ours
     assert abs(errors[0]) < 1e-9
-    assert errors[-1] < -0.5
+    assert abs(errors[-1]) > 0.1  # what rounding leaves of it
     K, S, _ = steady(np.array([[1.2]]), np.eye(1), np.eye(1), np.eye(1))
     _, Z = dense(np.array([[1.2]]), np.eye(1), K, S, np.ones((60, 1), bool))
     assert np.linalg.cond(Z[:, 0]) ** 2 > 1e8

@@ -13,7 +13,7 @@ from holdfast.numerics.multipliers import Long, descended
 from holdfast.numerics.quadratic_reach import largest
 from holdfast.numerics.reachability import Path, travelled
 
-MOST = 120
+MOST = 160
 """Unknowns up to which attacks are written out: beyond it the cone programs take over a second."""
 
 

@@ -41,6 +41,11 @@ class Certificate(NamedTuple):
     start: np.ndarray
 
 
+def evenly(of: Long) -> np.ndarray:
+    """Shares to begin with: alike for all limits, as much again for what came before them."""
+    return np.append(np.ones(len(of.b)), float(len(of.b)))
+
+
 def certificate(of: Long, share: np.ndarray) -> Certificate:
     """Any shares (m + 1,), made to sum to 1 and to leave out none."""
     share = np.maximum(np.asarray(share, float), LEAST)
@@ -90,14 +95,15 @@ def descended(
 
     Source: Silvey, Titterington and Torsney (1978); monotone along one axis by Yu (2010).
     """
-    found = _turn(of, functional, k, np.ones(len(of.b) + 1) if share is None else share)
+    found = _turn(of, functional, k, evenly(of) if share is None else share)
     last, mean, changes = found, _relative(of, found), 0
     for _ in range(rounds - 1):
         if found.upper <= max(enough, found.lower * (1.0 + CLOSE)) or found.lower > over:
             break
-        before = functional @ last.path.e[k - 1]
+        axis = functional @ last.path.e[k - 1]
         last = _turn(of, functional, k, last.held.share * np.sqrt(mean))
-        changes += abs(before @ functional @ last.path.e[k - 1]) < TURNED * last.lower * norm(before)
+        same = abs(axis @ functional @ last.path.e[k - 1])
+        changes += same < TURNED * norm(axis) * last.lower
         new = max(1.0 / OLDEST, 1.0 / (1.0 + 0.5 * changes))
         mean = (1.0 - new) * mean + new * _relative(of, last)
         high, low = min(found, last, key=_upper), max(found, last, key=_lower)

@@ -204,7 +204,8 @@ def theorem_4_less(
             "Theorem 4, distinct eigenvalues", "q_un may count equal unstable eigenvalues once: "
             "random plants and L, those bounded; plants where f is then smaller",
             [tried, tried, None], [tried, fine, fewer], fine == tried and fewer > 0,
-            "Not a claim of the paper. By eigenvectors and a Vandermonde matrix.",
+            "Not a claim of the paper; for periodic policies, by eigenvectors of A^L and a "
+            "Vandermonde matrix.",
         )  # fmt: skip
     return claim(
         "Theorem 4, f - 1", "f is sufficient, not necessary: random plants and L = 2 to 8, those "

@@ -5,11 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from holdfast.numerics.attack_sets import MOST
 from holdfast.numerics.multipliers import Long, factors
 from holdfast.numerics.reachability import backward, forward, joined
 from holdfast.parts import InvalidValue
-from holdfast.reach.forever import Forever, forever
+from holdfast.reach.forever import FAR, Forever, forever
 from holdfast.reach.pieces import Piece, bounds, stretch
 from holdfast.reach.setting import Setting
 
@@ -120,21 +119,19 @@ def stretches(
     """The steps 1 .. ``steps`` in groups that share a piece, with the attacks over it; and, where
     a group repeats one that came so many steps before it, that number.
 
-    From the start as long as that can be written out, and wherever nothing better is known. Else
-    from a set that a period keeps.
+    From the start up to `FAR`, and beyond where nothing better is known. Else from a set that a
+    period keeps, `FAR` steps before.
     """
-    width = max(1, int(np.max(np.sum(setting.alterable(steps), 1), initial=0)))
-    most = max(2, MOST // width)
     found: Forever | None = None
     seen: dict[tuple[int, int], tuple[int, Long]] = {}
     for ks, t in _groups(setting, steps):
-        if tight and t > most:
-            raise InvalidValue("steps", steps, f"at most {most} with every sum bounded (tight)")
-        if t > most and found is None:
+        if tight and t > FAR:
+            raise InvalidValue("steps", steps, f"at most {FAR} with every sum bounded (tight)")
+        if t > FAR and found is None:
             found = forever(setting)
         piece = Piece(0, t, None)
-        if t > most and found is not None and found.kept is not None and ks[0] > found.after:
-            first = _boundary(found, ks[0], t - most)
+        if t > FAR and found is not None and found.kept is not None and ks[0] > found.after:
+            first = _boundary(found, ks[0], t - FAR)
             piece = Piece(first, t, found.kept)
             place = (ks[0] - first, t - first)
             if place in seen:

@@ -7,13 +7,15 @@ import numpy as np
 
 from holdfast.numerics.attack_sets import MOST
 from holdfast.numerics.attackable import growth
-from holdfast.numerics.multipliers import Certificate, Long, certificate, descended, factors
+from holdfast.numerics.multipliers import Certificate, Long, certificate, descended, evenly, factors
 from holdfast.numerics.reachability import forward
 from holdfast.reach.pieces import Highest, Piece, highest, sizes_of, stretch, unknowns
 from holdfast.reach.setting import Setting
 
 LONGEST = 2000
 """Steps of a period that is looked at."""
+FAR = 256
+"""Steps that are looked at in one piece where there is a choice."""
 TURNS = 400
 """Periods after which a set that still grows is given up."""
 SETTLED = 1.0 + 1e-6
@@ -22,7 +24,7 @@ MARGINS = (1.0 + 1e-6, 1.0 + 1e-4, 1.0 + 1e-3)
 """What the set is enlarged by so that it is not below its limit."""
 ROUGH = 1e-3
 """Relative change of a set's size that is not worth another round."""
-FEW = 6
+FEW = 12
 """Turns of the multipliers where only a choice hangs on them."""
 PARTS = np.geomspace(1e-3, 0.3, 5)
 """What a step may take of a certificate, tried one after the other."""
@@ -118,7 +120,7 @@ def _fading_away(setting: Setting, of: Long) -> np.ndarray:
         return nothing
     held = descended(early, np.eye(n), setting.after, rounds=FEW).held
     first = factors(early, held)[-1]
-    even = certificate(of, np.append(np.ones(len(of.b)), float(len(of.b))))
+    even = certificate(of, evenly(of))
     W = nothing
     for _ in range(n):
         W = _after(of, even, W)
@@ -169,7 +171,7 @@ def _units(*of: np.ndarray) -> np.ndarray:
 def _largest(setting: Setting, of: Long, kept: np.ndarray) -> tuple[float, int]:
     """The largest error within a period that starts in the set, roughly, and its step."""
     of = of._replace(start=kept)
-    sizes = sizes_of(setting, of, certificate(of, np.ones(len(of.b) + 1)))
+    sizes = sizes_of(setting, of, certificate(of, evenly(of)))
     place = int(np.argmax(sizes)) + 1
     return descended(of, setting.functional, place, rounds=FEW).upper, place
 
@@ -206,14 +208,14 @@ def _held(setting: Setting, kept: np.ndarray) -> float:
 def worst(setting: Setting, found: Forever, limit: float = math.inf) -> Highest | None:
     """The largest error at any step ever, from above; None where no set is kept.
 
-    Over the first steps from the start itself; from then on over a period that as many whole
-    periods lie before as can be written out, from the set that all of them keep. Over ``limit``
-    the first bound that is will do.
+    Over the first steps from the start itself; from then on over a period that one whole period
+    lies before, or as many as can be written out, from the set that all of them keep. Over
+    ``limit`` the first bound that is will do.
     """
     if found.kept is None:
         return None
-    width = max(1, int(np.sum(setting.compromised)))
-    before = max(0, MOST // width // found.period - 1) * found.period
+    width, period = max(1, int(np.sum(setting.compromised))), found.period
+    before = max(MOST // width // period - 1, min(1, FAR // period - 1), 0) * period
     early = found.after + before
     last = early + found.period
     piece = Piece(found.after, last, found.kept)

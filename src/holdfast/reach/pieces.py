@@ -1,12 +1,13 @@
 """Stretches of steps, and what is certified of the errors in them."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from holdfast.numerics.attack_sets import MOST, attacks
-from holdfast.numerics.multipliers import Certificate, Long, certificate, descended, factors
-from holdfast.numerics.quadratic_reach import largest
+from holdfast.numerics.multipliers import Certificate, Long, certificate, descended, evenly, factors
+from holdfast.numerics.quadratic_reach import largest, outer
 from holdfast.reach.setting import Setting
 
 SHOWN = 15
@@ -94,7 +95,7 @@ def highest(
     step of which it is not true ends the search: the value is then a bound that is not tight.
     """
     of = stretch(setting, piece, tight)
-    share = np.ones(len(of.b) + 1)
+    share = evenly(of)
     places = np.array(steps) - piece.first - 1
     rough = sizes_of(setting, of, certificate(of, share))[places]
     value, slack = 0.0, SLACK if unknowns(of) <= MOST else LONG_SLACK
@@ -119,10 +120,11 @@ def highest(
 
 def _above(setting, piece: Piece, of: Long, k: int, share: np.ndarray, bar: float) -> float:
     """The upper bound at k, computed to the end or until it is under ``bar``."""
-    if small(of):
-        both = bounds(setting, piece, of, k)
-        return 0.0 if both is None else both.upper
-    return descended(of, setting.functional, k - piece.first, share, bar).upper
+    if unknowns(of) > MOST:
+        return descended(of, setting.functional, k - piece.first, share, bar).upper
+    found = attacks(of)
+    B = setting.functional @ found.errors[k - piece.first - 1]
+    return math.sqrt(outer(found.Z, found.w, found.b, B).value) if np.any(B) else 0.0
 
 
 def sizes_of(setting: Setting, of: Long, held: Certificate) -> np.ndarray:
