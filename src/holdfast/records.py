@@ -6,7 +6,7 @@ measurement ``y`` at k; predict with ``u``, then correct with ``y``.
 
 import functools
 from enum import IntEnum, IntFlag
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -159,7 +159,8 @@ class Enforcement(eqx.Module):
     def of(cls, every, duration, first) -> "Enforcement":
         """From one whole number per output each, or one for all of a list's length."""
         found = np.broadcast_arrays(*(np.asarray(v, np.int32) for v in (every, duration, first)))
-        return cls(*(np.array(v) for v in found))
+        rows: list[Any] = [np.array(v) for v in found]
+        return cls(*rows)
 
     def at(self, k: Int[Array, "*t"]) -> Bool[Array, "*t ny"]:
         """Whether each output is authenticated at step ``k`` (or at each of several)."""
@@ -167,7 +168,7 @@ class Enforcement(eqx.Module):
         return (since >= 0) & (jnp.mod(since, jnp.maximum(self.every, 1)) < self.duration)
 
     @property
-    def share(self) -> Float[Array, " ny"]:
+    def share(self) -> np.ndarray:
         """The share of each output's messages that is authenticated in the long run."""
         every = np.maximum(np.asarray(self.every), 1)
         return np.minimum(np.asarray(self.duration) / every, 1.0)

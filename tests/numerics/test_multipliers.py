@@ -72,7 +72,7 @@ def played(setting, of, path, k, value):
     assert np.linalg.norm(path.first) <= 1 + 1e-9
     costs = []
     ahead = np.asarray(of.m.ahead)
-    alterable = setting.alterable(len(of.index))
+    alterable = setting.alterable(len(of.sets))
     for i, a in enumerate(path.a):
         assert not np.any(a[~alterable[i]])
         told = np.sum((ahead @ e) ** 2, 1)

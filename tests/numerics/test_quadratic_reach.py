@@ -342,7 +342,7 @@ def test_what_did_not_converge_is_said_and_still_a_bound(monkeypatch):
     Z, w, b, B = drawn(5, "windows", 2, d=8)
     truth = outer(Z, w, b, B)
     for rounds in range(1, 6):
-        monkeypatch.setattr("holdfast.numerics.quadratic_reach.ROUNDS", rounds)
+        monkeypatch.setattr("holdfast.numerics.quadratic_interior.ROUNDS", rounds)
         found = outer(Z, w, b, B)
         assert not found.converged
         assert found.iterations == rounds

@@ -13,7 +13,7 @@ from holdfast.attacks.window import Window, windowed
 from holdfast.numerics.attack_sets import strongest
 from holdfast.numerics.multipliers import Long
 from holdfast.numerics.reachability import moves, patterns
-from holdfast.numerics.stealth import Stealth
+from holdfast.numerics.stealth import DETECTORS, Stealth
 from holdfast.parts import Attack, InvalidValue, Plant
 from holdfast.plants.watched import watched
 from holdfast.records import Enforcement, Injection, Knowledge
@@ -63,9 +63,9 @@ def build(
 
     for a Kalman filter in its steady state. ``at`` in seconds, the last sample before ``stop``
     unless given: to stay unnoticed after it, let ``stop`` lie behind the next authenticated block.
-    ``detector`` is the test that is to be deceived, ``level`` its false-alarm probability, ``length``
-    that of a windowed one. ``direction`` (n numbers): what of the error counts; all of it unless
-    given. ``enforcement``: when the sensors hit are authenticated, which the attacker knows.
+    ``detector`` is the test that is to be deceived, ``level`` its false-alarm probability,
+    ``length`` that of a windowed one. ``direction`` (n numbers): what of the error counts; all of
+    it unless given. ``enforcement``: when the sensors hit are authenticated, which he knows.
 
     Raises `InvalidValue` for a plant without a steady-state filter, channels that are no sensors,
     no finite ``stop``, a setting out of range.
@@ -77,9 +77,7 @@ def build(
         raise InvalidValue(
             "channels", channels or [channel], "sensors: a stealthy attack is on them"
         )
-    number("epsilon", epsilon)
-    if not 0.0 < epsilon < 1.0 - level:
-        raise InvalidValue("epsilon", epsilon, f"between 0 and 1 - level ({1.0 - level:g})")
+    _check(epsilon, level, length, detector)
     system = watched(plant)
     first, last = max(1, first_step(plant, start)), _end(plant, start, stop, detector)
     steps, hit = last - first, np.asarray(found.y)
@@ -100,10 +98,27 @@ def build(
     return windowed(plant, attack, start, stop)
 
 
+def _check(epsilon: float, level: float, length: int, detector: str) -> None:
+    number("epsilon", epsilon)
+    if not 0.0 < level < 1.0:
+        raise InvalidValue("level", level, "a probability between 0 and 1")
+    if not 0.0 < epsilon < 1.0 - level:
+        raise InvalidValue("epsilon", epsilon, f"between 0 and 1 - level ({1.0 - level:g})")
+    if detector not in DETECTORS:
+        raise InvalidValue("detector", detector, f"one of {', '.join(DETECTORS)}")
+    if detector == "sprt" and epsilon >= 0.5:
+        # of sums as long as can be, half raise the alarm by themselves
+        raise InvalidValue("epsilon", epsilon, "a probability under 0.5 with sprt")
+    if length != int(length) or length < 1:
+        raise InvalidValue("length", length, "a whole number of rows, at least 1")
+
+
 def _end(plant: Plant, start: float, stop: float, detector: str) -> int:
     """The step after the last one."""
     most = MOST_SUMS if detector == "sprt" else LONGEST
-    if not (math.isfinite(stop) and math.isfinite(start)):
+    if not math.isfinite(start):
+        raise InvalidValue("start", start, "a finite number of seconds")
+    if not math.isfinite(stop):
         raise InvalidValue("stop", stop, "seconds at which the attack ends: it is planned to there")
     last = first_step(plant, stop)
     if last - first_step(plant, start) > most:

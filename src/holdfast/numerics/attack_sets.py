@@ -34,7 +34,7 @@ class Attacks(NamedTuple):
 
 def attacks(of: Long) -> Attacks:
     """All attacks over a stretch, from e_0 = 0 or from e_0 = start xi with |xi| <= 1."""
-    m, index, first = of.m, of.index, of.start
+    m, index, first = of.m, of.sets, of.start
     F, B, G = (np.asarray(x) for x in (m.F, m.B, m.G))
     n, p = F.shape[1], B.shape[2]
     free = [np.flatnonzero(np.any(push, axis=0)) for push in np.asarray(m.push)]
@@ -62,9 +62,9 @@ def attacks(of: Long) -> Attacks:
         errors[i], at = e, at + count
     if start:
         Z[-1, :n, :n] = np.eye(n)
-    w, b = of.w.toarray(), of.b
+    w, b = np.asarray(of.w.toarray()), of.b
     if start:
-        w, b = block_diag(w, np.eye(1)), np.append(b, 1.0)
+        w, b = np.asarray(block_diag(w, np.eye(1))), np.append(b, 1.0)
     return Attacks(Z, w, b, errors, start)
 
 
@@ -77,20 +77,20 @@ def used(found: Attacks, theta: np.ndarray) -> float:
 def path(of: Long, found: Attacks, theta: np.ndarray) -> Path:
     """The attack theta (from e_0 = 0), step by step."""
     push = np.asarray(of.m.push)
-    v, at = np.zeros((len(of.index), push.shape[1])), 0
-    for i, which in enumerate(of.index):
+    v, at = np.zeros((len(of.sets), push.shape[1])), 0
+    for i, which in enumerate(of.sets):
         free = np.flatnonzero(np.any(push[which], axis=0))
         v[i, free] = theta[at : at + len(free)]
         at += len(free)
     n = found.errors.shape[1]
     before = np.concatenate([np.zeros((1, n)), found.errors[:-1] @ theta])
-    return travelled(of.m, of.index, before, v, np.zeros(n))
+    return travelled(of.m, of.sets, before, v, np.zeros(n))
 
 
 def strongest(of: Long, functional: np.ndarray, k: int) -> Path:
     """The attack from e_0 = 0 that makes |functional e_k| as large as was found, within limits."""
     free = np.any(np.asarray(of.m.push) != 0, axis=1).sum(1)
-    if np.sum(free[of.index]) > MOST:
+    if np.sum(free[of.sets]) > MOST:
         return descended(of, functional, k).path
     found = attacks(of)
     return path(

@@ -27,7 +27,7 @@ class Long(NamedTuple):
     """
 
     m: Moves
-    index: np.ndarray
+    sets: np.ndarray
     w: csr_array
     b: np.ndarray
     start: np.ndarray | None
@@ -53,7 +53,7 @@ def certificate(of: Long, share: np.ndarray) -> Certificate:
         share[-1] = 0.0
     share = share / np.sum(share)
     each = of.w.T @ (share[:-1] / of.b)
-    steps, n = len(of.index), of.m.F.shape[1]
+    steps, n = len(of.sets), of.m.F.shape[1]
     weights = np.column_stack([each[:steps], each[steps:].reshape(steps, -1)])
     start = np.zeros((n, n)) if of.start is None else of.start / np.sqrt(share[-1])
     return Certificate(share, weights, start)
@@ -61,8 +61,8 @@ def certificate(of: Long, share: np.ndarray) -> Certificate:
 
 def factors(of: Long, held: Certificate) -> np.ndarray:
     """Factors (t x n x n) of the ellipsoids of every e_k that a certificate gives."""
-    L = forward(of.m, of.index, held.weights, held.start)
-    T = backward(of.m, of.index, held.weights, np.zeros(len(of.index), np.int32))
+    L = forward(of.m, of.sets, held.weights, held.start)
+    T = backward(of.m, of.sets, held.weights, np.zeros(len(of.sets), np.int32))
     return joined(L, T)
 
 
@@ -122,7 +122,7 @@ def _lower(one: Descended) -> float:
 def _turn(of: Long, functional: np.ndarray, k: int, share: np.ndarray) -> Descended:
     """Both bounds by one set of multipliers."""
     held = certificate(of, share)
-    size, path = longest(of.m, of.index, held.weights, k, functional, held.start)
+    size, path = longest(of.m, of.sets, held.weights, k, functional, held.start)
     if of.start is not None:
         path = path._replace(first=path.first / np.sqrt(held.share[-1]))
     most = float(np.max(_spent(of, path)))

@@ -67,7 +67,7 @@ def moves(A, C, K, Q, alterable, blocks: int = 0) -> Moves:
             spread = spread - half.T @ half
             found[2][row, : len(out)] = solve_triangular(lower, told[out], lower=True)
         push = np.zeros((p, p))
-        push[np.ix_(inside, range(len(inside)))] = np.linalg.cholesky(spread)
+        push[np.ix_(inside, np.arange(len(inside)))] = np.linalg.cholesky(spread)
         found[0][row] = A - K @ keep @ told
         found[1][row] = -K @ push
         found[3][row] = keep @ told - told
@@ -77,7 +77,7 @@ def moves(A, C, K, Q, alterable, blocks: int = 0) -> Moves:
     for j in range(blocks):
         ahead[j] = solve_triangular(whole, told @ move, lower=True)
         move = (A - K @ told) @ move
-    return Moves(*found, ahead)
+    return Moves(found[0], found[1], found[2], found[3], found[4], ahead)
 
 
 def patterns(alterable: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -149,8 +149,8 @@ def _still(m: Moves) -> Moves:
     """The same with one more set, of a step at which nothing happens."""
     n, p = m.F.shape[1], m.B.shape[2]
     more = (np.eye(n), np.zeros((n, p)), np.zeros((p, n)), np.zeros((p, n)), np.zeros((p, p)))
-    rows = (np.concatenate([x, y[None]]) for x, y in zip(m[:5], more, strict=True))
-    return Moves(*rows, m.ahead)
+    rows = [np.concatenate([x, y[None]]) for x, y in zip(m[:5], more, strict=True)]
+    return Moves(rows[0], rows[1], rows[2], rows[3], rows[4], m.ahead)
 
 
 def _length(t: int) -> int:

@@ -108,7 +108,7 @@ class Stealth(NamedTuple):
         shape = (steps, steps)
         if not len(ages):
             return csr_array(shape)
-        return csr_array(diags_array([1.0] * len(ages), offsets=-ages, shape=shape))
+        return csr_array(diags_array([1.0] * len(ages), offsets=(-ages).tolist(), shape=shape))
 
     def _counted(self, age: np.ndarray) -> np.ndarray:
         """Whether a residual of this age counts in the sum that is tested."""

@@ -129,25 +129,22 @@ def stretches(
             raise InvalidValue("steps", steps, f"at most {FAR} with every sum bounded (tight)")
         if t > FAR and found is None:
             found = forever(setting)
-        piece = Piece(0, t, None)
-        if t > FAR and found is not None and found.kept is not None and ks[0] > found.after:
-            first = _boundary(found, ks[0], t - FAR)
-            piece = Piece(first, t, found.kept)
-            place = (ks[0] - first, t - first)
-            if place in seen:
-                before, of = seen[place]
-                yield piece, of, ks, ks[0] - before
-                continue
-        of = stretch(setting, piece, tight)
-        if piece.first:
-            seen[place] = ks[0], of
-        yield piece, of, ks, 0
+        if t <= FAR or found is None or found.kept is None or ks[0] <= found.after:
+            piece = Piece(0, t, None)
+            yield piece, stretch(setting, piece, tight), ks, 0
+            continue
+        first = _boundary(found, ks[0], t - FAR)
+        piece, place = Piece(first, t, found.kept), (ks[0] - first, t - first)
+        if place not in seen:
+            seen[place] = ks[0], stretch(setting, piece)
+        before, of = seen[place]
+        yield piece, of, ks, ks[0] - before
 
 
 def _moved_on(share: np.ndarray | None, of: Long) -> np.ndarray | None:
     """The multipliers of the step before, each limit one step older; None where they do not fit."""
     count = len(of.b)
-    if share is None or count != len(of.index) or (share[-1] > 0) != (of.start is not None):
+    if share is None or count != len(of.sets) or (share[-1] > 0) != (of.start is not None):
         return None
     if len(share) == count + 1:
         return share

@@ -94,12 +94,14 @@ def _kept(setting: Setting, period: int) -> np.ndarray | None:
         kept = _fixed(of, certificate(of, _fading(len(of.b), part, period)), first)
         if kept is not None and (size := _largest(setting, of, kept)[0]) < least:
             best, least = kept, size
-    for _ in range(ROUNDS if best is not None else 0):
+    if best is None:
+        return None
+    for _ in range(ROUNDS):
         kept = _fixed(of, _suited(setting, of, best), first)
         if kept is None or (size := _largest(setting, of, kept)[0]) >= least * (1.0 - ROUGH):
             break
         best, least = kept, size
-    return None if best is None else best * _held(setting, best)
+    return best * _held(setting, best)
 
 
 def _fading(count: int, part: float, period: int) -> np.ndarray:
@@ -135,7 +137,7 @@ def _fixed(of: Long, held: Certificate, more: np.ndarray) -> np.ndarray | None:
     for _ in range(TURNS):
         new = _after(of, held, W)
         if np.any(more):
-            new = np.linalg.qr(np.hstack([new, more]).T, mode="r").T
+            new = np.asarray(np.linalg.qr(np.hstack([new, more]).T, mode="r")).T
         if not np.all(np.isfinite(new)):
             return None
         if _ratio(new, W) <= SETTLED:
@@ -150,7 +152,7 @@ def _fixed(of: Long, held: Certificate, more: np.ndarray) -> np.ndarray | None:
 def _after(of: Long, held: Certificate, W: np.ndarray) -> np.ndarray:
     """A factor of the set after a period, from one of the set before it."""
     start = W / np.sqrt(float(held.share[-1]))
-    return forward(of.m, of.index, held.weights, start)[-1]
+    return forward(of.m, of.sets, held.weights, start)[-1]
 
 
 def _ratio(inner: np.ndarray, outer: np.ndarray) -> float:
@@ -185,11 +187,11 @@ def _suited(setting: Setting, of: Long, kept: np.ndarray) -> Certificate:
     of = of._replace(start=kept)
     _, place = _largest(setting, of, kept)
     grown = np.eye(len(kept))
-    for which in of.index[:place]:
+    for which in of.sets[:place]:
         grown = np.asarray(of.m.F)[which] @ grown
     on = setting.functional @ grown
     weak = 1e-3 * np.linalg.norm(on, 2) * np.eye(len(kept))
-    return descended(of, np.vstack([on, weak]), len(of.index), rounds=FEW).held
+    return descended(of, np.vstack([on, weak]), len(of.sets), rounds=FEW).held
 
 
 def _held(setting: Setting, kept: np.ndarray) -> float:

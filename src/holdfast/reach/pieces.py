@@ -50,7 +50,7 @@ def small(of: Long) -> bool:
 def unknowns(of: Long) -> int:
     """How many numbers the attacker chooses."""
     free = np.sum(np.any(np.asarray(of.m.push) != 0, axis=1), axis=1)
-    return int(np.sum(free[of.index]))
+    return int(np.sum(free[of.sets]))
 
 
 def bounds(

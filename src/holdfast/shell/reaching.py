@@ -22,7 +22,7 @@ from holdfast.shell import runtime
 from holdfast.shell.attackable_content import compromised_outputs
 from holdfast.shell.calibrating import busy
 from holdfast.shell.enforcing import enforcement_flags
-from holdfast.shell.errors import InputError, shown
+from holdfast.shell.errors import InputError, one_of, shown
 from holdfast.shell.matrices import matrix
 from holdfast.shell.reach_content import (
     policy_content,
@@ -137,9 +137,13 @@ def _stealth(asked: Asked, found: ScenarioFile) -> Stealth:
     level = float(getattr(detector, "level", 0.01)) if asked.level is None else asked.level
     if not 0.0 < level < 1.0:
         raise InputError("--level", "", str(level), "a probability between 0 and 1")
-    if not 0.0 < asked.epsilon < 1.0 - level:
-        expected = f"a probability between 0 and 1 - level ({1.0 - level:g})"
+    room = 1.0 - level
+    if not 0.0 < asked.epsilon < room:
+        expected = f"a probability between 0 and 1 - level ({room:g})"
         raise InputError("--epsilon", "", str(asked.epsilon), expected)
+    if asked.detector == "sprt" and asked.epsilon >= 0.5:
+        # of sums as long as can be, half raise the alarm by themselves
+        raise InputError("--epsilon", "", str(asked.epsilon), "a probability under 0.5 with sprt")
     weights = (1.0,) * 10
     if asked.length is not None:
         weights = (1.0,) * asked.length
@@ -166,16 +170,19 @@ def _costs(text: str | None, outputs: tuple[str, ...]) -> list[float] | None:
     """``NAME=3,NAME=1``: what a message of each output costs, 1 where it is not named."""
     if text is None:
         return None
-    found = dict.fromkeys(outputs, 1.0)
+    found: dict[str, float] = {}
     for part in text.split(","):
         name, _, value = (piece.strip() for piece in part.partition("="))
-        compromised_outputs(name, outputs)
+        if name not in outputs:
+            raise InputError("--cost", "", shown(name), one_of(outputs, name))
+        if name in found:
+            raise InputError("--cost", "", f"{shown(name)} twice", "every output once")
         try:
             found[name] = float(value)
         except ValueError:
             expected = "NAME=NUMBER with commas between"
             raise InputError("--cost", "", shown(part), expected) from None
-    return list(found.values())
+    return [found.get(name, 1.0) for name in outputs]
 
 
 def _write(folder: str, name: str, text: str, figure: Any) -> None:
