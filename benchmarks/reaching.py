@@ -85,7 +85,7 @@ def main() -> None:
         assert differ < AGREE, differ
         print(
             f"vehicle, k = {k}: recursion {1e3 * ours:.2f} ms for every step, dense formula "
-            f"{theirs:.2f} s for one, {theirs / ours:.0f} times as long (they differ by {differ:.0e})"
+            f"{theirs:.2f} s for one, {theirs / ours:.0f} times as long (difference {differ:.0e})"
         )
     setting = asked(vehicle_tracking.build(), "sprt", 0.015, EVERY)
     reach(setting, LONG)

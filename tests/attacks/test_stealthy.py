@@ -141,8 +141,7 @@ WORST = {
 
 
 @pytest.mark.parametrize("detector", WORST)
-@pytest.mark.parametrize("every", [None, 10])
-@pytest.mark.parametrize("direction", [None, [1.0, 0.0]])
+@pytest.mark.parametrize(("every", "direction"), [(None, None), (10, None), (10, [1.0, 0.0])])
 def test_it_reaches_what_can_be_reached(plant, system, detector, every, direction):
     """At step 15; the plan goes on to the end of the block behind it."""
     keys, how = WORST[detector]

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from attackers import asked, drawn, furthest, horizon, together, vehicle, written
 
+from attackers import asked, drawn, furthest, horizon, together, vehicle, written
 from holdfast.numerics.attack_sets import attacks
 from holdfast.numerics.multipliers import CLOSE, certificate, descended, factors
 from holdfast.numerics.quadratic_reach import largest
@@ -103,7 +103,7 @@ def test_a_row_against_cone_programs(detector):
 @pytest.mark.parametrize("aware", [True, False])
 def test_any_shares_give_a_bound(detector, aware):
     """Whatever they are: as they come, one alone, unnormalised, zero."""
-    setting, of = problem(7, detector, aware=aware)
+    _, of = problem(7, detector, aware=aware)
     rng = np.random.default_rng(1)
     found, n = attacks(of), len(of.b)
     tries = [rng.exponential(size=n + 1), np.eye(n + 1)[2], 1e6 * np.ones(n + 1), np.zeros(n + 1)]

@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
-from attackers import drawn, filtered
 from scipy.linalg import solve_triangular
 
+from attackers import drawn, filtered
 from holdfast.numerics.linalg import SMALL
 from holdfast.numerics.reachability import (
     backward,

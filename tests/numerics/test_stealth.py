@@ -4,9 +4,9 @@ import functools
 
 import numpy as np
 import pytest
-from attackers import alpha
 from scipy.stats import chi2, ncx2
 
+from attackers import alpha
 from holdfast.numerics.noncentral import alphas, largest_shift, weighted_noncentral_tail
 from holdfast.numerics.stealth import Stealth
 

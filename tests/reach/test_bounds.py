@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from attackers import asked, drawn, filtered, horizon, largest, together, vehicle
 from scipy.stats import chi2
 
+from attackers import asked, drawn, filtered, horizon, largest, together, vehicle
 from holdfast.numerics.noncentral import alpha_chi2
 from holdfast.parts import InvalidValue
 from holdfast.reach.bounds import reach
@@ -98,13 +98,13 @@ def test_a_plant_with_a_singular_matrix():
 
 
 @pytest.mark.parametrize("comp", [[True, True], [True, False], [False, True]])
-def test_an_unstable_plant_for_sixty_steps(comp):
+def test_an_unstable_plant_for_forty_steps(comp):
     system = filtered([[2.0, 0.1], [0.0, 0.8]], np.eye(2), np.eye(2), np.eye(2))
-    found = reach(asked(system, "chi_square", compromised=comp), 60)
-    # eighteen orders of magnitude, and both bounds agree
+    found = reach(asked(system, "chi_square", compromised=comp), 40)
+    # twelve orders of magnitude, and both bounds agree
     assert np.all(found.exact)
     assert np.all(found.lower <= found.norm * (1 + 1e-9))
-    assert (found.norm[-1] > 1e17) == comp[0]
+    assert (found.norm[-1] > 1e11) == comp[0]
 
 
 def test_a_per_step_bound_in_the_sum_is_too_little():

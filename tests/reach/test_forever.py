@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from attackers import Attacks, asked, authenticated, drawn, filtered, furthest, together, vehicle
 
+from attackers import Attacks, asked, authenticated, drawn, filtered, furthest, together, vehicle
 from holdfast.numerics.stealth import Stealth
 from holdfast.reach.bounds import reach
 from holdfast.reach.forever import forever, worst
@@ -53,10 +53,24 @@ def period(setting, found) -> Attacks:
     return Attacks(np.array(errors), limits)
 
 
+@pytest.mark.parametrize(
+    ("name", "detector"),
+    [("position", "chi_square"), ("one always", "chi_square"), ("unaware", "windowed")],
+)
+def test_a_period_keeps_the_set(name, detector):
+    keeps(name, detector)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("detector", DETECTORS)
-def test_a_period_keeps_the_set(name, detector):
-    setting = made(name, detector)
+def test_a_period_keeps_the_set_of_others(name, detector):
+    for seed, size in ((1, 1.05), (2, 1.3)):
+        keeps(name, detector, size, seed)
+
+
+def keeps(name, detector, size=1.05, seed=1):
+    setting = made(name, detector, size, seed)
     found = forever(setting)
     assert found.bounded
     assert found.kept is not None

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from attackers import asked, authenticated, drawn, horizon, together
-from systems import quiet_plant
 
+from attackers import asked, authenticated, drawn, horizon, together
 from holdfast.parts import InvalidValue
 from holdfast.plants.library import bicycle, dcacc
 from holdfast.plants.watched import watched
 from holdfast.records import Enforcement
+from systems import quiet_plant
 
 SYSTEM = drawn(0, 2, 3)
 POLICIES = {

@@ -170,13 +170,14 @@ def test_who_does_not_know_the_policy(path, command):
 
 
 def test_tight_bounds_every_sum(path, command):
-    flags = [*ALL, *SUMS, "--enforce", "every=4"]
+    flags = [*ALL, *SUMS, "--enforce", "every=4", "--level", "0.5"]
     tight, loose = (reached(command, path, 5, *flags, *more) for more in (["--tight"], []))
-    same(tight, asked(SYSTEM, "sprt", together(2, 4), level=LEVEL), 5, tight=True)
+    same(tight, asked(SYSTEM, "sprt", together(2, 4), level=0.5), 5, tight=True)
     assert tight["bounded"] is None
     less = np.array(tight["norm"]) / np.array(loose["norm"])
     assert np.all(less <= 1 + 1e-7)
-    assert np.min(less) < 0.999
+    # sums that end before the block have a smaller bound
+    assert np.min(less) < 0.9
 
 
 def test_levels_and_windows_of_the_scenario(path, command):
@@ -226,40 +227,41 @@ def test_a_policy_and_what_is_reached_under_it(path, command):
     assert max(norm) > 0.7
 
 
-def test_a_policy_for_ever(path, command, tmp_path):
+def test_a_policy_in_words(path, command):
+    """The first line is what the other command takes."""
+    code, out, _ = command("policy", path, "--limit", "1e-4", *ALL)
+    assert code == 0
+    assert out.startswith("--enforce every=1,for=1,first=1\n100 % of all messages")
+    assert "for ever (limit 0.0001;" in out
+
+
+@pytest.mark.slow
+def test_a_policy_for_ever(path, command):
     found = searched(command, path, 0.7)
     assert [found[key] for key in ("every", "for", "first")] == [3, 1, 3]
     assert (found["steps"], found["proof"], found["detector"]) == (None, "period", "chi_square")
     assert found["worst"] <= 0.7
     seen = reached(command, path, 12, *ALL, "--enforce", "every=3")
     assert (seen["bounded"], max(seen["lower"]) <= found["worst"]) == (True, True)
-    seen = reached(command, path, 12, *ALL, "--enforce", "every=4")
-    assert max(seen["lower"]) > 0.7
-    # in words, as the flags of the other command
-    code, out, _ = command("policy", path, "--limit", "0.7", *ALL)
-    assert code == 0
-    assert out.startswith("--enforce every=3,for=1,first=3\n33.3 % of all messages")
-    assert "for ever (limit 0.7;" in out
 
 
 def test_every_output_its_own(path, command):
-    flags = ["--compromised", POSITION, *SUMS, "--steps", "20", "--cost", f"{POSITION}=3"]
-    found = searched(command, path, 0.3, *flags, "--per-sensor")
+    who = ["--compromised", POSITION]
+    flags = [*who, "--steps", "8", "--cost", f"{POSITION}=3", "--per-sensor"]
+    found = searched(command, path, 0.3, *flags)
     assert set(found) == POLICY_KEYS | {"per_sensor"}
+    # the other one is not attacked
     assert set(found["per_sensor"]) == {POSITION}
     row = found["per_sensor"][POSITION]
     assert set(row) == {"every", "for", "first"}
-    # the outputs differ
     assert [found[key] for key in ("every", "for", "first")] == [None] * 3
     assert found["share"] == pytest.approx(row["for"] / row["every"] / 2)
     assert found["cost"] == pytest.approx(3 * row["for"] / row["every"])
     text = ",".join(f"{key}={value}" for key, value in row.items())
     enforce = ["--enforce", f"{POSITION}:{text}"]
-    norm = reached(command, path, 20, "--compromised", POSITION, *SUMS, *enforce)["norm"]
+    norm = reached(command, path, 8, *who, *enforce)["norm"]
     assert max(norm) <= found["worst"] * (1 + 1e-9) <= 0.3 * (1 + 1e-9)
-    both = searched(command, path, 0.3, *flags)
-    assert found["cost"] < both["cost"]
-    code, out, _ = command("policy", path, "--limit", "0.3", *flags, "--per-sensor")
+    code, out, _ = command("policy", path, "--limit", "0.3", *flags)
     assert (code, out.splitlines()[0]) == (0, " ".join(enforce))
 
 

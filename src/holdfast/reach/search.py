@@ -145,9 +145,10 @@ class Search:
         assert held is not None
         every = int(held.every[0]) * duration // int(held.duration[0]) + 1
         made = self._global(duration)
-        if every > MOST or self.reached(made(every)).value > self.limit:
-            return best
-        return min(best, self._longest(made, every), key=cost_of)
+        for shortest in range(every, min(every + self._around(), MOST) + 1):
+            if self.reached(made(shortest)).value <= self.limit:
+                return min(best, self._longest(made, shortest), key=cost_of)
+        return best
 
     def _global(self, duration: int) -> Callable[[int], Enforcement]:
         p = len(self.price)
@@ -169,7 +170,7 @@ class Search:
             every = next((every for every in range(MOST, shortest, -1) if does(every)), shortest)
             return self._tight(made(every))
         top = _last(lambda every: self._early(made(every)), shortest, MOST)
-        around = BEYOND if self._turns() else 0
+        around = self._around()
 
         def near(every: int) -> bool:
             return any(does(one) for one in range(every, max(every - around, shortest) - 1, -1))
@@ -185,11 +186,14 @@ class Search:
         steps = range(1, min(last, self.steps or last) + 1)
         return highest(asked, Piece(0, last, None), steps, self.limit).value <= self.limit
 
-    def _turns(self) -> bool:
-        """Whether a mode that does not fade changes its sign or turns."""
+    def _around(self) -> int:
+        """How many neighbours of a distance are tried: some where a mode that does not fade changes
+        its sign or turns.
+        """
         values = np.linalg.eigvals(self.setting.system.A)
         lasting = values[np.abs(values) >= UNSTABLE]
-        return bool(np.any(np.abs(lasting - np.abs(lasting)) > TURNED * np.abs(lasting)))
+        turns = np.any(np.abs(lasting - np.abs(lasting)) > TURNED * np.abs(lasting))
+        return BEYOND if turns else 0
 
     def _tight(self, enforcement: Enforcement) -> Policy:
         """The record of a policy that does, with what it comes to and not only that it does."""
@@ -221,7 +225,7 @@ class Search:
             lasting, first = np.zeros(p, int), np.ones(p, int)
             lasting[chosen] = duration
             turn = np.arange(len(chosen)) * every // len(chosen)
-            first[chosen] = np.maximum(2, every - turn)
+            first[chosen] = every - turn if every > duration else 1
             return Enforcement.of([every] * p, lasting, first)
 
         always = self.reached(made(duration))

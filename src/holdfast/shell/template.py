@@ -23,6 +23,7 @@ KINDS = {
 """What a template has unless it is asked for something else."""
 
 REQUIRED = {
+    "epsilon": 0.001,
     "value": 3.0,
     "rate": 0.5,
     "amplitude": 3.0,
