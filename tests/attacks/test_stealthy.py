@@ -56,23 +56,29 @@ def build(plant, channels=BOTH, **keys):
 
 
 def scenario(plant, attack, enforcement=NEVER, detector=chi_square):
-    """The filter starts where it would be after a long time."""
     filters = kalman.build(plant, [0.0, 0.0], watched(plant).P)
     monitor = Monitor(filters, detector.build(plant, level=LEVEL, on="residual"))
     return Scenario(plant, jnp.zeros(2), monitor, None, (attack,), enforcement)
 
 
 @eqx.filter_jit
-def runs(of, keys):
-    return jax.vmap(lambda key: simulate(of, key, STEPS))(keys)
+def runs(of, keys, starts):
+    def one(key, x0):
+        return simulate(eqx.tree_at(lambda s: s.x0, of, x0), key, STEPS)
+
+    return jax.vmap(one)(keys, starts)
 
 
 def pair(of, count=200):
-    """Runs with the attack and without it, of the same noise."""
+    """Runs with the attack and without it, of the same noise; the filter's first error is as large
+    as it says.
+    """
     keys = jax.random.split(jax.random.key(3), count)
+    half = np.linalg.cholesky(of.monitor.estimator.P0)
+    starts = jnp.asarray(np.random.default_rng(3).normal(size=(count, 2)) @ half.T)
     (attack,) = of.attacks
     still = eqx.tree_at(lambda s: s.attacks[0].attack.plan, of, 0.0 * attack.attack.plan)
-    return runs(of, keys), runs(still, keys)
+    return runs(of, keys, starts), runs(still, keys, starts)
 
 
 def predicted(system, plan):
@@ -168,11 +174,12 @@ def test_what_counts_decides_the_plan(plant, system):
     ends = np.abs([predicted(system, planned(one))[0][-1] for one in plans])
     assert ends[0, 0] > ends[1, 0]
     assert ends[1, 1] > ends[0, 1]
-    early = build(plant, at=0.2)
-    peak = np.linalg.norm(predicted(system, planned(early))[0], axis=1)
-    late = np.linalg.norm(predicted(system, planned(build(plant)))[0], axis=1)
-    assert peak[FIRST] > late[FIRST]
-    assert late[-1] > peak[-1]
+    early, late = (
+        np.linalg.norm(predicted(system, planned(build(plant, at=at)))[0], axis=1)
+        for at in (0.2, None)
+    )
+    assert early[FIRST] > late[FIRST]
+    assert late[-1] > early[-1]
 
 
 def sums(values, length):
@@ -186,12 +193,9 @@ def test_no_alarm_is_more_probable_than_it_may_be(plant, system, detector, polic
     cost = costs(system, planned(attack))
     k = np.arange(1, len(cost) + 1)
     h = chi2.isf(LEVEL, 2)
-    lengths = {"chi_square": 1, "windowed": 6, "sprt": len(cost)}
-    spent = sums(cost, lengths[detector])
+    spent = sums(cost, {"chi_square": 1, "windowed": 6, "sprt": len(cost)}[detector])
     dof = {"chi_square": 2 + 0 * k, "windowed": 12 + 0 * k, "sprt": 2 * k}[detector]
-    limit = {"chi_square": h + 0 * k, "windowed": chi2.isf(LEVEL, dof), "sprt": 2 * h + dof}[
-        detector
-    ]
+    limit = 2 * h + dof if detector == "sprt" else chi2.isf(LEVEL, dof)
     without = chi2.sf(limit, dof)
     if detector != "sprt":
         np.testing.assert_allclose(without, LEVEL, rtol=1e-12)
@@ -242,10 +246,6 @@ def test_a_scenario_tells_it_the_policy(tmp_path):
     held = np.column_stack([(k >= 6) & (k % 6 < 2), (k >= 13) & ((k - 13) % 8 == 0)])
     assert held.any(0).all()
     np.testing.assert_array_equal(planned(attack) == 0, held)
-    blind = text.replace("[enforcement.sensors.measured_position]\nevery = 6\nfor = 2\n", "")
-    (tmp_path / "s.toml").write_text(blind)
-    held[:, 0] = False
-    np.testing.assert_array_equal(planned(load_scenario(tmp_path / "s.toml").attacks[0]) == 0, held)
 
 
 @pytest.mark.slow
@@ -254,40 +254,28 @@ def test_without_a_policy_it_goes_on_and_on(plant, system):
     for stop in (1.0, 10.0, 100.0):
         plan = planned(build(plant, start=0.01, stop=stop))
         shifts, _ = predicted(system, plan)
-        assert np.max(costs(system, plan)) <= alpha(EPSILON, 2, chi2.isf(LEVEL, 2)) ** 2 * (
-            1 + 1e-6
-        )
+        most = alpha(EPSILON, 2, chi2.isf(LEVEL, 2)) ** 2
+        assert np.max(costs(system, plan)) <= most * (1 + 1e-6)
         sizes.append(np.linalg.norm(shifts[-1]))
     assert len(plan) == 9999
-    # a speed that is off by no less and no less moves the position by its integral
     assert sizes[1] > 10 * sizes[0]
     assert sizes[2] > 10 * sizes[1]
 
 
 WRONG = [
     ({"channels": ["actuator:accel"]}, "channels: found ['actuator:accel'], expected sensors"),
-    ({"channels": [BOTH[0], "actuator:accel"]}, "expected sensors"),
     ({"channels": ["sensor:gps"]}, "found 'sensor:gps', expected one of"),
-    ({"channels": []}, "an empty list"),
     ({"stop": np.inf}, "stop: found inf, expected seconds at which the attack ends"),
-    ({"stop": np.nan}, "stop: found nan"),
     ({"stop": 0.1}, "stop: found 0.1, expected at least one sample after start"),
     ({"stop": 1e6}, "stop: found 1000000.0, expected at most 20000 samples"),
     ({"stop": 50.0, "detector": "sprt"}, "expected at most 2000 samples"),
     ({"start": np.nan}, "start: found nan, expected a finite number of seconds"),
     ({"epsilon": 0.0}, "epsilon: found 0.0, expected between 0 and 1 - level (0.985)"),
-    ({"epsilon": -0.1}, "epsilon: found -0.1"),
-    ({"epsilon": 0.985}, "epsilon: found 0.985"),
-    ({"epsilon": np.nan}, "epsilon: found nan, expected a finite number"),
     ({"epsilon": 0.6, "detector": "sprt"}, "expected a probability under 0.5 with sprt"),
-    ({"level": 0.0}, "level: found 0.0, expected a probability between 0 and 1"),
     ({"level": 1.5}, "level: found 1.5, expected a probability between 0 and 1"),
     ({"length": 0, "detector": "windowed"}, "length: found 0, expected a whole number of rows"),
     ({"at": 0.05}, "at: found 0.05, expected seconds from 0.1 to before 0.5"),
-    ({"at": 0.5}, "at: found 0.5, expected seconds from 0.1 to before 0.5"),
     ({"direction": [1.0]}, "direction: found [1.0], expected 2 finite numbers, not all 0"),
-    ({"direction": [0.0, 0.0]}, "expected 2 finite numbers, not all 0"),
-    ({"direction": [np.nan, 0.0]}, "expected 2 finite numbers, not all 0"),
 ]
 
 

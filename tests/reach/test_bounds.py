@@ -49,9 +49,11 @@ def two_sided(seed, n, p, detector, tight, aware, policy):
         np.testing.assert_array_equal(found.horizon, expected)
 
 
-@pytest.mark.parametrize("policy", POLICIES)
+@pytest.mark.parametrize(
+    ("policy", "aware"),
+    [*((name, True) for name in POLICIES), ("together", False), ("two in a row", False)],
+)
 @pytest.mark.parametrize(("detector", "tight"), DETECTORS)
-@pytest.mark.parametrize("aware", [True, False])
 def test_no_attack_is_beyond_and_one_is_there(policy, detector, tight, aware):
     two_sided(1, 2, 2, detector, tight, aware, policy)
 
@@ -149,6 +151,19 @@ def test_the_figures_of_the_vehicle():
     three = [longest[L][0] for L in (20, 30, 35)]
     np.testing.assert_allclose(three, [0.609, 0.683, 0.716], atol=5e-4)
     assert longest[30][1] == pytest.approx(0.816, abs=5e-4)
+
+
+def test_algorithm_1_stops_where_it_must_not():
+    """With L = 20 and h = 8.4 the second block reaches less than the first, and the sixtieth more.
+
+    The noise is not stated: the ratio of the two is that of any Q much larger than R.
+    """
+    system = filtered([[1.0, 0.01], [0.0, 1.0]], np.eye(2), 3.196 * np.eye(2), 0.03196 * np.eye(2))
+    setting = asked(system, "sprt", together(2, 20), level=chi2.sf(8.4, 2))
+    blocks = reach(setting, 1200).norm.reshape(60, 20).max(1)
+    assert blocks[0] == pytest.approx(1.1985, abs=5e-4)
+    assert blocks[1] < blocks[0]
+    assert blocks[59] == pytest.approx(1.695, abs=1e-3)
 
 
 @pytest.mark.slow

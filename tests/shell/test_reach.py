@@ -201,13 +201,11 @@ def test_a_table_and_sentences(path, command):
     code, out, err = command("reach", path, "--steps", "40", *ALL, *SUMS, "--enforce", "every=20")
     assert (code, err) == (0, "")
     head, first, *_ = out.splitlines()
-    assert head.split("  ")[0] == "step"
-    assert "stealthy until" in head
+    assert head.startswith("step")
     assert first.split()[0::2] == ["1", "20"]
     assert f'Whoever alters "{POSITION}" and "{SPEED}"' in out
     assert "Nothing is said of all time" in out
-    code, out, _ = command("reach", path, "--steps", "3", *ALL)
-    assert "Without limit as time goes on" in out
+    assert "Without limit as time goes on" in command("reach", path, "--steps", "3", *ALL)[1]
 
 
 # --- policy ---------------------------------------------------------------------------------------
@@ -294,11 +292,8 @@ def test_a_folder(path, command, tmp_path, name):
         assert {"every", "for", "share", "cost", "worst"} == set(mine)
 
 
-def test_a_figure_beside_attacks_that_were_found(path, command, tmp_path):
-    """Two lines, and words, where the bounds differ."""
+def test_a_figure_and_words(path, command, tmp_path):
     flags = ["--steps", "4", "--detector", "windowed", "--length", "3", *ALL]
     code, out, _ = command("reach", path, *flags, "-o", tmp_path)
-    assert code == 0
+    assert (code, out.split()[0]) == (0, "step")
     assert (tmp_path / "reach.png").stat().st_size > 1000
-    assert json.loads((tmp_path / "reach.json").read_text())["kind"] in ("exact", "outer")
-    assert "step" in out
