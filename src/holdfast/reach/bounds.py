@@ -124,9 +124,11 @@ def stretches(
     """
     found: Forever | None = None
     seen: dict[tuple[int, int], tuple[int, Long]] = {}
-    for ks, t in _groups(setting, steps):
-        if tight and t > FAR:
-            raise InvalidValue("steps", steps, f"at most {FAR} with every sum bounded (tight)")
+    groups = list(_groups(setting, steps))
+    if tight and groups[-1][1] > FAR:
+        until = f"{steps}, which have to be stealthy until step {groups[-1][1]}"
+        raise InvalidValue("steps", until, f"at most step {FAR} with every sum bounded (tight)")
+    for ks, t in groups:
         if t > FAR and found is None:
             found = forever(setting)
         if t <= FAR or found is None or found.kept is None or ks[0] <= found.after:
