@@ -12,12 +12,11 @@ from holdfast.numerics.reachability import (
     backward,
     cheapest,
     forward,
-    informed,
     joined,
     moves,
     patterns,
-    triangle,
 )
+from holdfast.numerics.square_root import informed, triangle
 
 SHAPES = [(1, 1), (2, 3), (4, 2), (6, 5)]
 

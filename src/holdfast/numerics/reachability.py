@@ -16,7 +16,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.linalg import cho_solve, solve_triangular
 
-from holdfast.numerics.linalg import SMALL, solve_lower
+from holdfast.numerics.linalg import solve_lower
+from holdfast.numerics.square_root import (
+    backward_step,
+    forward_step,
+    informed,
+    times,
+    triangle,
+)
 
 
 class Moves(NamedTuple):
@@ -84,57 +91,6 @@ def patterns(alterable: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The distinct rows of ``alterable`` (T x p), and which of them each step has (T,)."""
     rows, index = np.unique(np.asarray(alterable, bool), axis=0, return_inverse=True)
     return rows, index.reshape(-1).astype(np.int32)
-
-
-def triangle(m: Float[Array, "r n"]) -> Float[Array, "n n"]:
-    """R upper triangular with R'R = m'm, r >= n, by Householder reflections.
-
-    Large rows first keeps it accurate row by row. Unrolled up to `SMALL`, so that a loop over
-    steps is one compiled kernel.
-    """
-    n = m.shape[1]
-    if n > SMALL:
-        return jnp.linalg.qr(m, mode="r")
-    rows = []
-    for j in range(n):
-        column = m[:, j]
-        length = jnp.sqrt(jnp.sum(column * column))
-        turned = column.at[0].add(jnp.where(column[0] < 0, -length, length))
-        size = jnp.sum(turned * turned)
-        share = jnp.sum(turned[:, None] * m, 0) * (2.0 / jnp.where(size > 0, size, 1.0))
-        m = m - turned[:, None] * share[None, :]
-        rows.append(jnp.where(jnp.arange(n) < j, 0.0, m[0]))
-        m = m[1:]
-    return jnp.stack(rows)
-
-
-def _times(a, b):
-    return jnp.sum(a[:, :, None] * b[None], 1) if max(a.shape + b.shape) <= SMALL else a @ b
-
-
-def informed(L: Float[Array, "n n"], G: Float[Array, "r n"]) -> Float[Array, "n n"]:
-    """A factor of (W^-1 + G'G)^-1 with W = L L', which may be singular: L R^-1,
-    R'R = I + (G L)' G L.
-    """
-    n = L.shape[0]
-    R = triangle(jnp.concatenate([_times(G, L), jnp.eye(n)]))
-    return solve_lower(R.T, jnp.ones(n, bool), L.T).T
-
-
-def forward_step(F, B, G, L):
-    """A factor of W at i from one at i - 1: F (W^-1 + G'G)^-1 F' + B B'."""
-    moved = _times(F, informed(L, G))
-    return triangle(jnp.concatenate([moved.T, B.T])).T
-
-
-def backward_step(F, B, G, T):
-    """A factor of the cost to come, S = T'T, at i - 1 from one at i:
-    F' S (I + B B' S)^-1 F + G'G.
-    """
-    n = F.shape[0]
-    R = triangle(jnp.concatenate([_times(T, B).T, jnp.eye(n)]))
-    after = solve_lower(R.T, jnp.ones(n, bool), T)
-    return triangle(jnp.concatenate([_times(after, F), G]))
 
 
 def _step(m: Moves, index, weight):
@@ -272,7 +228,7 @@ def _walk(m: Moves, index, weights, after, planned, start):
     def one(e, at):
         index, weight, T, to, v = at
         F, B, _ = _step(m, index, weight)
-        reach, n = _times(T, B), T.shape[0]
+        reach, n = times(T, B), T.shape[0]
         lower = triangle(jnp.concatenate([reach.T, jnp.eye(n)])).T
         # -B' S (I + B B' S)^-1 F e by the factor of I + T B B' T'
         half = solve_lower(lower, jnp.ones(n, bool), T @ (F @ (e - to)))
