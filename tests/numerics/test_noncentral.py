@@ -128,7 +128,7 @@ def test_tails_agree_with_scipy():
         assert tail(0.0, dof, 3.0) == chdtrc(dof, 3.0)
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(
     st.floats(1.0, 1e5),
     st.floats(1e-6, 0.99),
@@ -140,7 +140,7 @@ def test_the_bound_rises_with_epsilon_and_the_tail_with_the_shift(dof, level, sh
     epsilon = share * float(chdtr(dof, threshold))
     shift = alpha_chi2(epsilon, dof, threshold)
     assert shift > 0
-    assert excess(shift**2, dof, threshold) == pytest.approx(epsilon, rel=1e-11)
+    assert excess(shift**2, dof, threshold) == pytest.approx(epsilon, rel=1e-10)
     assert alpha_chi2(epsilon / more, dof, threshold) < shift
     assert excess((shift / more) ** 2, dof, threshold) < epsilon
     assert tail(shift**2, dof, threshold * more) < tail(shift**2, dof, threshold)

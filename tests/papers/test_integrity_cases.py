@@ -16,6 +16,8 @@ from holdfast.reach.forever import Highest
 from holdfast.records import Enforcement
 from holdfast.report.paper_figures import png
 
+pytestmark = pytest.mark.slow
+
 OPPOSITE = {
     "holds": "fails", "fails": "holds", "reproduced": "not reproduced",
     "not reproduced": "reproduced",

@@ -19,6 +19,8 @@ from holdfast.papers import integrity_sprt as sprt
 from holdfast.papers.integrity_systems import VEHICLE, Policy, sure
 from holdfast.report.tables import json_safe
 
+pytestmark = pytest.mark.slow
+
 LISTED = tomllib.loads((Path(__file__).parent / "integrity_statements.toml").read_text())
 LISTED = LISTED["statement"]
 OPPOSITE = {"holds": "fails", "fails": "holds"}

@@ -158,6 +158,7 @@ def test_nobody_moves_anything(detector):
         assert worst(setting, found).value == 0.0
 
 
+@pytest.mark.slow
 def test_what_could_be_moved_before_the_policy_began_is_not_forgotten():
     """Sensor 1 is authenticated at every step from 30 on; what it did by then fades slowly, in a
     direction that later moves do not reach.

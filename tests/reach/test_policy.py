@@ -35,6 +35,7 @@ def plain(found):
 # --- the sum constraint: every distance is tried, and none that does is longer -------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [90, pytest.param(300, marks=pytest.mark.slow)])
 def test_sums_over_a_horizon(steps):
     setting = asked(VEHICLE, "sprt")
@@ -95,6 +96,7 @@ def turns():
     return {(L, f): under(setting, together(1, L, f), STEPS) for f in (1, 2) for L in range(f, 13)}
 
 
+@pytest.mark.slow
 def test_a_turning_plant_is_not_monotone(turns):
     setting = asked(TURNING, "chi_square", together(1, 4))
     assert turns[4, 1] > 1.2 * turns[5, 1]
@@ -105,6 +107,7 @@ def test_a_turning_plant_is_not_monotone(turns):
     assert largest(setting, k) == pytest.approx(norm[k - 1], rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "limit",
     [0.29, *(pytest.param(limit, marks=pytest.mark.slow) for limit in (0.1, 0.21, 0.26, 0.3))],
@@ -120,6 +123,7 @@ def test_the_rarest_of_a_turning_plant(turns, limit):
     assert found.worst <= limit
 
 
+@pytest.mark.slow
 def test_longer_blocks_where_they_are_needed(turns):
     """Single samples do up to every third step, pairs every ninth, though not every eighth."""
     assert max(L for (L, f), value in turns.items() if f == 1 and value <= 0.29) == 3
@@ -225,6 +229,7 @@ def test_an_output_that_is_not_attacked_is_not_checked():
 # --- error against share --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_what_more_and_less_would_do():
     setting = asked(VEHICLE, "chi_square")
     best = policy(setting, 0.6, 20)

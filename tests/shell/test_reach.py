@@ -225,6 +225,7 @@ def test_a_policy_and_what_is_reached_under_it(path, command):
     assert max(norm) > 0.7
 
 
+@pytest.mark.slow
 def test_a_policy_in_words(path, command):
     """The first line is what the other command takes."""
     code, out, _ = command("policy", path, "--limit", "1e-4", *ALL)
@@ -243,6 +244,7 @@ def test_a_policy_for_ever(path, command):
     assert (seen["bounded"], max(seen["lower"]) <= found["worst"]) == (True, True)
 
 
+@pytest.mark.slow
 def test_every_output_its_own(path, command):
     who = ["--compromised", POSITION]
     flags = [*who, "--steps", "8", "--cost", f"{POSITION}=3", "--per-sensor"]

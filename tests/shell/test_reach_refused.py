@@ -82,7 +82,7 @@ OF_REACH = {
     ),
     "too long": (
         ["--detector", "sprt", "--tight", "--enforce", "every=5000"],
-        ["--steps: found 5, expected at most ", " with every sum bounded (tight)"],
+        ["--steps: found 5, which have to be stealthy until step 5000", "at most step 256"],
     ),
     **{f"enforce {case}": (["--enforce", text], words) for case, (text, words) in ENFORCE.items()},
 }
