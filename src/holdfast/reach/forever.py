@@ -26,7 +26,7 @@ ROUGH = 1e-3
 """Relative change of a set's size that is not worth another round."""
 FEW = 12
 """Turns of the multipliers where only a choice hangs on them."""
-PARTS = np.geomspace(1e-3, 0.3, 5)
+PARTS = np.geomspace(3e-3, 0.1, 3)
 """What a step may take of a certificate, tried one after the other."""
 ROUNDS = 6
 """Times that the multipliers and the set that they keep are chosen in turn."""
