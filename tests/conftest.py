@@ -1,6 +1,7 @@
 """One set-up for all tests: 64 bits, strict promotion, run-time types, one thread."""
 
 import atexit
+import gc
 import os
 import shutil
 import sys
@@ -51,6 +52,21 @@ def pytest_configure(config):
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     if not config.getoption("--no-typecheck"):
         jaxtyping.install_import_hook("holdfast", CHECKER)
+
+
+MAPPINGS = 30_000
+"""Memory mappings from which on a worker forgets its programs: each holds some, the kernel allows
+65 530, and a compiler that gets no more ends the process."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def room_for_programs():
+    """Keeps the mappings of compiled programs under what the kernel allows."""
+    yield
+    held = Path("/proc/self/maps")
+    if held.exists() and held.read_bytes().count(b"\n") > MAPPINGS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")

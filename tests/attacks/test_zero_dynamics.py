@@ -103,6 +103,7 @@ def test_a_zero_of_one_input_and_one_output(which):
         assert np.abs(x[-1]).max() > 5 * np.abs(y).max()
 
 
+@pytest.mark.slow
 def test_several_channels_and_sensors_among_them():
     """Two actuators, three sensors of which one may be falsified, and an attack channel."""
     rng = np.random.default_rng(8)

@@ -53,9 +53,15 @@ def period(setting, found) -> Attacks:
     return Attacks(np.array(errors), limits)
 
 
+OTHER_CASES = (("one always", "chi_square"), ("unaware", "windowed"))
+
+
 @pytest.mark.parametrize(
     ("name", "detector"),
-    [("position", "chi_square"), ("one always", "chi_square"), ("unaware", "windowed")],
+    [
+        ("position", "chi_square"),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in OTHER_CASES),
+    ],
 )
 def test_a_period_keeps_the_set(name, detector):
     keeps(name, detector)

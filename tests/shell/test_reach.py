@@ -136,6 +136,7 @@ def test_the_scenario_s_policy_unless_another_is_given(path, command):
     same(found, asked(SYSTEM, "sprt", together(2, 3), level=LEVEL), 7)
 
 
+@pytest.mark.slow
 def test_each_residual_bounded(path, command):
     found = reached(command, path, 8, "--compromised", POSITION, "--enforce", "every=6")
     setting = asked(SYSTEM, "chi_square", together(2, 6), compromised=[True, False], level=LEVEL)
@@ -180,6 +181,7 @@ def test_tight_bounds_every_sum(path, command):
     assert np.min(less) < 0.9
 
 
+@pytest.mark.slow
 def test_levels_and_windows_of_the_scenario(path, command):
     found = reached(command, path, 3, *ALL, "--level", "0.05", "--epsilon", "0.01")
     assert (found["level"], found["epsilon"]) == (0.05, 0.01)
