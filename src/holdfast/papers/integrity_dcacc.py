@@ -232,8 +232,8 @@ def figure_7_without(run: Run) -> Row:
 
 
 def volume(shape: np.ndarray) -> float:
-    """The product of an ellipsoid's semi-axes."""
-    return float(np.sqrt(np.linalg.det(shape)))
+    """The product of an ellipsoid's semi-axes; rounding may make the shortest negative."""
+    return float(np.prod(np.sqrt(np.maximum(np.linalg.eigvalsh(shape), 0.0))))
 
 
 def figure_8(run: Run) -> Row:
