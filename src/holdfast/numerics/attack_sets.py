@@ -68,10 +68,10 @@ def attacks(of: Long) -> Attacks:
     return Attacks(Z, w, b, errors, start)
 
 
-def used(found: Attacks, theta: np.ndarray) -> float:
-    """The largest share of a limit that the attack theta uses: feasible up to 1."""
-    squares = np.sum((found.Z @ theta) ** 2, axis=1)
-    return float(np.max((found.w @ squares) / found.b))
+def unknowns(of: Long) -> int:
+    """How many numbers the attacker chooses."""
+    free = np.sum(np.any(np.asarray(of.m.push) != 0, axis=1), axis=1)
+    return int(np.sum(free[of.sets]))
 
 
 def path(of: Long, found: Attacks, theta: np.ndarray) -> Path:
@@ -89,8 +89,7 @@ def path(of: Long, found: Attacks, theta: np.ndarray) -> Path:
 
 def strongest(of: Long, functional: np.ndarray, k: int) -> Path:
     """The attack from e_0 = 0 that makes |functional e_k| as large as was found, within limits."""
-    free = np.any(np.asarray(of.m.push) != 0, axis=1).sum(1)
-    if np.sum(free[of.sets]) > MOST:
+    if unknowns(of) > MOST:
         return descended(of, functional, k).path
     found = attacks(of)
     return path(

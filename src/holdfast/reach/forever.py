@@ -5,11 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from holdfast.numerics.attack_sets import MOST
+from holdfast.numerics.attack_sets import MOST, unknowns
 from holdfast.numerics.attackable import growth
 from holdfast.numerics.multipliers import Certificate, Long, certificate, descended, evenly, factors
 from holdfast.numerics.reachability import forward
-from holdfast.reach.pieces import Highest, Piece, highest, sizes_of, stretch, unknowns
+from holdfast.reach.pieces import Highest, Piece, highest, sizes_of, stretch
 from holdfast.reach.setting import Setting
 
 LONGEST = 2000

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from holdfast.numerics.attack_sets import MOST, attacks
+from holdfast.numerics.attack_sets import MOST, attacks, unknowns
 from holdfast.numerics.multipliers import Certificate, Long, certificate, descended, evenly, factors
 from holdfast.numerics.quadratic_reach import largest, outer
 from holdfast.reach.setting import Setting
@@ -47,12 +47,6 @@ def small(of: Long) -> bool:
     return of.start is None and unknowns(of) <= MOST
 
 
-def unknowns(of: Long) -> int:
-    """How many numbers the attacker chooses."""
-    free = np.sum(np.any(np.asarray(of.m.push) != 0, axis=1), axis=1)
-    return int(np.sum(free[of.sets]))
-
-
 def bounds(
     setting: Setting, piece: Piece, of: Long, k: int, share: np.ndarray | None = None
 ) -> Bounds | None:
@@ -85,16 +79,14 @@ class Highest(NamedTuple):
     k: int
 
 
-def highest(
-    setting: Setting, piece: Piece, steps: range, limit: float = np.inf, tight: bool = False
-) -> Highest:
+def highest(setting: Setting, piece: Piece, steps: range, limit: float = np.inf) -> Highest:
     """The largest of the upper bounds at ``steps``, without computing all of them.
 
     Once one is known, of every other step it only has to be shown that its bound is no larger, or
     larger by `SLACK` at most. With a ``limit`` that is what has to be shown of all, and the first
     step of which it is not true ends the search: the value is then a bound that is not tight.
     """
-    of = stretch(setting, piece, tight)
+    of = stretch(setting, piece)
     share = evenly(of)
     places = np.array(steps) - piece.first - 1
     rough = sizes_of(setting, of, certificate(of, share))[places]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from holdfast.parts import InvalidValue
-from holdfast.reach.search import Policy, Search, Told, cost_of
+from holdfast.reach.search import Policy, Search, cost_of
 from holdfast.reach.setting import Setting
 from holdfast.records import Enforcement
 
@@ -20,15 +20,14 @@ def policy(
     steps: int | None = None,
     costs: Sequence[float] | None = None,
     per_sensor: bool = False,
-    told: Told = lambda text: None,
 ) -> Policy:
     """The policy of least cost with |functional E e_k| <= ``limit`` at every k (<= ``steps``).
 
     All outputs together, ``for`` steps in a row every ``every``, the first block at ``every``;
     ``for`` up to the smaller of observability index and unstable modes (Theorem 4). With
     ``per_sensor`` also each output its own: which of them, staggered, at distances of their own.
-    ``costs`` (p,): of an authenticated message of each output, 1 unless given. ``told`` hears of
-    every candidate. The setting's own enforcement is not looked at.
+    ``costs`` (p,): of an authenticated message of each output, 1 unless given. The setting's own
+    enforcement is not looked at.
 
     Raises `InvalidValue` for a limit or a cost that is none.
 
@@ -40,7 +39,7 @@ def policy(
         raise InvalidValue("cost", costs, f"{p} positive numbers, one per output")
     if not (math.isfinite(limit) and limit > 0):
         raise InvalidValue("limit", limit, "a positive number")
-    search = Search(setting, limit, steps, price, told)
+    search = Search(setting, limit, steps, price)
     free = search.reached(None)
     if free.value <= limit:
         return search.found(None, free)
@@ -61,7 +60,7 @@ def trade_off(
         return [best]
     p = len(setting.compromised)
     price = np.ones(p) if costs is None else np.asarray(costs, float)
-    search = Search(setting, math.inf, steps, price, lambda text: None)
+    search = Search(setting, math.inf, steps, price)
     found, seen = [], set()
     for scale in SCALES:
         every = np.rint(scale * np.asarray(held.every))

@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,8 +28,6 @@ SMALL = 240
 """Unknowns of a period up to which a policy's error is computed to the end."""
 MULTIPLES = (2, 3, 4)
 """Of the others' distance that a sensor of its own may have."""
-
-Told = Callable[[str], Any]
 
 
 class Reached(NamedTuple):
@@ -93,10 +91,8 @@ def cost_of(found: Policy) -> float:
 class Search:
     """One search: what is asked, and what has been tried."""
 
-    def __init__(self, setting: Setting, limit: float, steps: int | None, price, told: Told):
-        self.setting, self.limit, self.steps, self.price, self.told = (
-            setting, limit, steps, price, told,
-        )  # fmt: skip
+    def __init__(self, setting: Setting, limit: float, steps: int | None, price):
+        self.setting, self.limit, self.steps, self.price = setting, limit, steps, price
         self.known: dict[tuple, Reached] = {}
         s = setting.system
         self.modes = movable(s.A, s.C, s.K)
@@ -163,7 +159,6 @@ class Search:
         """
 
         def does(every: int) -> bool:
-            self.told(f"every {every}")
             return self.reached(made(every)).value <= self.limit
 
         if self.setting.stealth.detector == "sprt":

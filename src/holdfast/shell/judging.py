@@ -15,7 +15,7 @@ from holdfast.report.tables import json_safe
 from holdfast.shell import runtime
 from holdfast.shell.calibrating import busy
 from holdfast.shell.errors import InputError, one_of
-from holdfast.shell.writing import FILES, check_place, replacing, unwritable, write_text
+from holdfast.shell.writing import FILES, check_place, write_figures, write_text
 
 WIDE = 160
 """Columns of a table that goes to a file or a pipe."""
@@ -37,7 +37,7 @@ def papers(name: str | None, as_json: bool, output: str | None) -> None:
             study = STUDIES[paper]()
         rows += study.rows
         if output is not None:
-            _write_figures(Path(output), study.figures())
+            write_figures(output, study.figures())
     text = json.dumps(json_safe([row.as_dict() for row in rows]), allow_nan=False, indent=1)
     if output is not None:
         write_text(Path(output) / "papers.json", text + "\n")
@@ -45,18 +45,6 @@ def papers(name: str | None, as_json: bool, output: str | None) -> None:
         print(text)
     else:
         _print(rows)
-
-
-def _write_figures(folder: Path, figures: dict[str, Any]) -> None:
-    from holdfast.report.paper_figures import png
-
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise unwritable(folder, error) from None
-    for name, figure in figures.items():
-        with replacing(folder / f"{name}.png") as temporary:
-            temporary.write_bytes(png(figure))
 
 
 def _print(rows: list[Row]) -> None:

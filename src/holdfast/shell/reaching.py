@@ -31,7 +31,7 @@ from holdfast.shell.reach_content import (
     reach_sentences,
 )
 from holdfast.shell.scenario import ScenarioFile, read_scenario
-from holdfast.shell.writing import FILES, check_place, unwritable, write_text
+from holdfast.shell.writing import FILES, check_place, write_figures, write_text
 
 LINES = 14
 """Rows of the table that a person reads."""
@@ -186,16 +186,8 @@ def _costs(text: str | None, outputs: tuple[str, ...]) -> list[float] | None:
 
 
 def _write(folder: str, name: str, text: str, figure: Any) -> None:
-    from holdfast.report.paper_figures import png
-    from holdfast.shell.writing import replacing
-
-    try:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise unwritable(folder, error) from None
+    write_figures(folder, {name: figure})
     write_text(Path(folder) / f"{name}.json", text + "\n")
-    with replacing(Path(folder) / f"{name}.png") as temporary:
-        temporary.write_bytes(png(figure))
 
 
 def _reach_figure(found: Reach) -> Any:

@@ -5,6 +5,7 @@ import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from holdfast.shell.errors import InputError
 
@@ -43,6 +44,19 @@ def write_text(path: str | Path, text: str) -> None:
     """The text, whole or not at all."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="")
+
+
+def write_figures(folder: str | Path, figures: dict[str, Any]) -> None:
+    """Figures by name as PNG files in a folder, which is made where there is none."""
+    from holdfast.report.paper_figures import png
+
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise unwritable(folder, error) from None
+    for name, figure in figures.items():
+        with replacing(Path(folder) / f"{name}.png") as temporary:
+            temporary.write_bytes(png(figure))
 
 
 def check_place(path: str | Path) -> None:
