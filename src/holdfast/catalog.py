@@ -17,9 +17,10 @@ from holdfast.attacks import (
     replay,
     sine,
     stealthy,
+    switch,
     zero_dynamics,
 )
-from holdfast.controllers import feedback, pole_placement
+from holdfast.controllers import feedback, linearising, pole_placement
 from holdfast.detectors import (
     care_paper,
     chi_square,
@@ -36,6 +37,8 @@ from holdfast.estimators import (
     kalman,
     l1_decoder,
     l1_kalman,
+    nise,
+    nisme,
     secure_fusion,
     unknown_input,
     unscented,
@@ -47,7 +50,9 @@ from holdfast.plants.library import (
     five_sensors,
     gps_imu,
     quadrotor,
+    swing,
     uav,
+    unicycle,
     vehicle_tracking,
 )
 
@@ -62,6 +67,9 @@ PLANTS: Builders = {
     "gps_imu": gps_imu.build,
     "vehicle_tracking": vehicle_tracking.build,
     "dcacc": dcacc.build,
+    "unicycle": unicycle.build,
+    "swing": swing.network,
+    "swing68": swing.build,
 }
 
 ESTIMATORS: Builders = {
@@ -74,6 +82,8 @@ ESTIMATORS: Builders = {
     "secure_fusion": secure_fusion.build,
     "l1_decoder": l1_decoder.build,
     "l1_kalman": l1_kalman.build,
+    "nise": nise.build,
+    "nisme": nisme.build,
 }
 
 DETECTORS: Builders = {
@@ -98,11 +108,13 @@ ATTACKS: Builders = {
     "covert": covert.build,
     "stealthy": stealthy.build,
     "zero_dynamics": zero_dynamics.build,
+    "switch": switch.build,
 }
 
 CONTROLLERS: Builders = {
     "lqr": feedback.build,
     "pole_placement": pole_placement.build,
+    "linearising": linearising.build,
 }
 
 SECTIONS: dict[str, Builders] = {

@@ -16,6 +16,7 @@ from holdfast.parts import Attack, Controller, Detector, Estimator, Plant
 from holdfast.records import (
     Enforcement,
     Estimate,
+    Held,
     Injection,
     Knowledge,
     Observation,
@@ -61,10 +62,11 @@ def monitor_step(
     """
     before, judged = state
     after, estimate = monitor.estimator.step(before, observation)
-    leaves = jax.tree.leaves(eqx.filter(after, eqx.is_inexact_array))
+    watched = eqx.filter(after, _watched, is_leaf=_is_held)
+    leaves = jax.tree.leaves(watched)
     ok = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))
     # leaf by leaf, so that a covariance shared over a batch stays shared
-    after = jax.tree.map(_finite_or, after, before)
+    after = jax.tree.map(_finite_or, after, before, is_leaf=_is_held)
     n = estimate.x.shape[0]
     unknown = jnp.diag(jnp.full(n, jnp.inf))
     estimate = eqx.tree_at(
@@ -81,13 +83,23 @@ def monitor_step(
         ),
     )
     if estimate.a is not None:
-        estimate = eqx.tree_at(lambda e: e.a, estimate, _finite_or_zero(estimate.a))
+        estimate = eqx.tree_at(lambda e: e.a, estimate, replace_fn=_finite_or_zero)
+    if estimate.p is not None:
+        estimate = eqx.tree_at(lambda e: e.p, estimate, replace_fn=_finite_or_zero)
     judged, verdict = monitor.detector.step(judged, estimate)
     return (after, judged), (estimate, verdict)
 
 
+def _is_held(leaf):
+    return isinstance(leaf, Held)
+
+
+def _watched(leaf):
+    return not _is_held(leaf) and eqx.is_inexact_array(leaf)
+
+
 def _finite_or(new, old):
-    if not eqx.is_inexact_array(new):
+    if not _watched(new):
         return new
     return jnp.where(jnp.all(jnp.isfinite(new)), new, old)
 
@@ -108,7 +120,7 @@ def replay(monitor: Monitor, observations: Observation) -> Trace:
 
     start = (monitor.init(), jnp.zeros(observations.u.shape[-1]))
     _, rows = jax.lax.scan(row, start, observations)
-    return Trace(*rows, delay=_delay(monitor))
+    return Trace(*rows, **_told(monitor))
 
 
 @eqx.filter_jit
@@ -119,6 +131,8 @@ def simulate(scenario: Scenario, key: PRNGKeyArray, steps: int) -> Trace:
     clean sample of k and injects into it, the monitor sees the result. ``Trace.injection`` of
     row k is what was injected at k, ``Trace.x`` the true state at k. Where the plant has
     limits the state stops at them, and an attack that asks for more than they allow saturates.
+    Where an attacker throws a switch at k-1, the state moves to k, and where he does at k, y_k
+    is measured, with the plant in that position; a jump of the state comes before y_k.
 
     An output that is authenticated at k (``Scenario.enforcement``) arrives as the sensor sent it:
     C x + D u + H 0 + v. Neither an injection into it nor an attack channel that falsifies it
@@ -147,14 +161,17 @@ def simulate(scenario: Scenario, key: PRNGKeyArray, steps: int) -> Trace:
         return zero_u if scenario.controller is None else scenario.controller.command(estimate)
 
     def row(carry, inputs):
-        x, state, attack_states, injected, u = carry
+        x, position, state, attack_states, injected, u = carry
         k, key = inputs
         move_key, measure_key = jax.random.split(key)
+        plant = scenario.plant.at_position(position)
         x = plant.advance(move_key, k, x, u + injected.u, injected.d)
         clean = plant.measure(measure_key, k, x, u, zero_d)
         attack_states, injected = _inject(
             scenario.attacks, attack_states, Knowledge(k, u, clean), zero_d
         )
+        x, position, injected = _switched(plant, x, position, injected)
+        plant = scenario.plant.at_position(position)
         y = plant.measure(measure_key, k, x, u + injected.u, injected.d)
         everything = jnp.ones(y.shape, bool)
         trusted = ~everything
@@ -168,11 +185,12 @@ def simulate(scenario: Scenario, key: PRNGKeyArray, steps: int) -> Trace:
         state, (estimate, verdict) = monitor_step(monitor, state, observation)
         u = command(estimate)
         injected = _saturated(plant, k + 1, u, injected)
-        rows = Trace(observation, estimate, verdict, x, injected, _delay(monitor))
-        return (x, state, attack_states, injected, u), rows
+        rows = Trace(observation, estimate, verdict, x, injected, **_told(monitor))
+        return (x, position, state, attack_states, injected, u), rows
 
     u = command(estimate)
-    carry = (scenario.x0, state, attack_states, _saturated(plant, 1, u, injected), u)
+    x, position, injected = _switched(plant, scenario.x0, jnp.asarray(0, jnp.int32), injected)
+    carry = (x, position, state, attack_states, _saturated(plant, 1, u, injected), u)
     inputs = (jnp.arange(1, steps + 1, dtype=jnp.int32), jax.random.split(run_key, steps))
     return jax.lax.scan(row, carry, inputs)[1]
 
@@ -192,21 +210,39 @@ def _let_through(plant: Plant, k, x, u, injected: Injection, trusted) -> Injecti
         stopped = jnp.any(falsified & trusted[:, None], 0)
         felt = jnp.any(falsified & ~trusted[:, None], 0) | jnp.any(moved, 0)
         d = jnp.where(stopped & ~felt, 0.0, d)
-    return Injection(injected.u, through_y, d)
+    return Injection(injected.u, through_y, d, injected.switch)
 
 
-def _delay(monitor: Monitor) -> int:
-    """Rows by which the attack estimate lags; only estimators that can wait have the setting."""
-    return getattr(monitor.estimator, "delay", 0)
+def _switched(plant: Plant, x, position, injected: Injection):
+    """State and position after whoever throws a switch, the position noted in the injection."""
+    if len(plant.positions) == 1:
+        return x, position, injected
+    asked = position * 0 if injected.switch is None else injected.switch
+    x, position = plant.jumped(x, position, asked)
+    return (
+        x,
+        position,
+        eqx.tree_at(lambda i: i.switch, injected, position, is_leaf=lambda leaf: leaf is None),
+    )
+
+
+def _told(monitor: Monitor) -> dict[str, Any]:
+    """What goes with a trace: rows by which the attack estimate lags, and the names of modes."""
+    settings = ("delay", "modes", "named")
+    found = {name: getattr(monitor.estimator, name, None) for name in settings}
+    return {name: value for name, value in found.items() if value is not None}
 
 
 def _inject(
     attacks: tuple[Attack, ...], states: tuple, known: Knowledge, zero_d: Array
 ) -> tuple[tuple, Injection]:
-    total = Injection(jnp.zeros_like(known.u), jnp.zeros_like(known.y), zero_d)
+    u, y, d, switch = jnp.zeros_like(known.u), jnp.zeros_like(known.y), zero_d, None
     after = []
     for attack, state in zip(attacks, states, strict=True):
         state, injection = attack.step(state, known)
         after.append(state)
-        total = jax.tree.map(jnp.add, total, injection)
-    return tuple(after), total
+        u, y, d = u + injection.u, y + injection.y, d + injection.d
+        if injection.switch is not None:  # the last one to throw it has it
+            before = injection.switch * 0 if switch is None else switch
+            switch = jnp.where(injection.switch != 0, injection.switch, before)
+    return tuple(after), Injection(u, y, d, switch)

@@ -43,6 +43,10 @@ class Plant(eqx.Module):
     def output(self, k, x, u, d) -> Float[Array, " ny"]:
         """The measurement at k without noise."""
 
+    def jacobian(self, k, x, u, d) -> tuple[Float[Array, "n n"], Float[Array, "n nd"]]:
+        """The derivatives of `transition` by x and d; a plant that knows its zeros does better."""
+        return jax.jacfwd(lambda x, d: self.transition(k, x, u, d), argnums=(0, 1))(x, d)
+
     @abstractmethod
     def noise(self, k, x, u) -> tuple[Float[Array, "n n"], Float[Array, "ny ny"]]:
         """The covariances of process and measurement noise at k."""
@@ -60,6 +64,29 @@ class Plant(eqx.Module):
     def saturated(self, k, u, d) -> Float[Array, " nd"]:
         """The attack over the interval that ends at k that is possible and nearest to d."""
         return d
+
+    @property
+    def positions(self) -> tuple[str, ...]:
+        """The names of the positions that the plant's switches can be in; the first is normal."""
+        return ("normal",)
+
+    def at_position(self, position: Int[Array, ""]) -> "Plant":
+        """The plant with its switches in one of the `positions`, by number."""
+        return self
+
+    def jumped(
+        self, x: Float[Array, " n"], position: Int[Array, ""], asked: Int[Array, ""]
+    ) -> tuple[Float[Array, " n"], Int[Array, ""]]:
+        """State and position just after a sample at which the switches are asked to be at
+        ``asked``: (x, j)+ = Omega(x, j) where the state lies in a jump set.
+        """
+        return x, asked
+
+    def innovation(
+        self, y: Float[Array, " ny"], expected: Float[Array, " ny"]
+    ) -> Float[Array, " ny"]:
+        """How far y is from what was expected; angles go the shorter way round."""
+        return y - expected
 
     def measure(self, key: PRNGKeyArray, k, x, u, d) -> Float[Array, " ny"]:
         """The measurement at k, noise included."""

@@ -182,7 +182,9 @@ class Estimate(eqx.Module):
     projection, which is what a sound test needs. ``d_rows``, ``d_bound``: the attack's
     constraint set ``d_rows d <= d_bound`` at this step. ``residual``, ``residual_cov``: the
     innovation; an unknown-input filter's is blind to the attack by construction. ``a``: what
-    each sensor's sample is off by, 0 where it is believed, from estimators that say so.
+    each sensor's sample is off by, 0 where it is believed; ``p``: the probability of each of
+    the modes that are weighed, and ``mode``: the one believed, by its number in
+    ``Trace.named``; each from estimators that say so.
 
     Conventions of the covariances: a diagonal of ``inf`` marks a quantity that the data do
     not determine (its covariances are 0, and an attack's value too), a diagonal of 0 in
@@ -201,6 +203,8 @@ class Estimate(eqx.Module):
     residual_cov: Float[Array, "*t ny ny"]
     status: Int[Array, "*t"]
     a: Float[Array, "*t ny"] | None = None
+    p: Float[Array, "*t modes"] | None = None
+    mode: Int[Array, "*t"] | None = None
 
     @classmethod
     def without_attack(cls, x, x_cov, residual, residual_cov, status, a=None) -> "Estimate":
@@ -227,6 +231,15 @@ class Verdict(eqx.Module):
     channel_alarms: Bool[Array, "*t m"]
 
 
+class Held(eqx.Module):
+    """A part of an estimator's state that it keeps finite itself, replaced seldom and large.
+
+    `holdfast.loop.monitor_step` looks through everything else at every step.
+    """
+
+    value: Any
+
+
 class Knowledge(eqx.Module):
     """What an attacker knows at step k: the step, the command and the sample before attack."""
 
@@ -236,17 +249,22 @@ class Knowledge(eqx.Module):
 
 
 class Injection(eqx.Module):
-    """What an attacker adds at step k: to the actuators, the sensors, the attack channels."""
+    """What an attacker adds at step k: to the actuators, the sensors, the attack channels.
+
+    ``switch``: the position of the plant's switches, by number; None where nobody throws one.
+    """
 
     u: Float[Array, "*t nu"]
     y: Float[Array, "*t ny"]
     d: Float[Array, "*t nd"]
+    switch: Int[Array, "*t"] | None = None
 
 
 class Trace(eqx.Module):
     """A whole run, time along the leading axis; ``x`` and ``injection`` only if simulated.
 
-    ``delay``: rows by which the attack estimate lags what it would otherwise be of.
+    ``delay``: rows by which the attack estimate lags what it would otherwise be of. ``modes``,
+    ``named``: the names that go with ``estimate.p`` and ``estimate.mode``.
     """
 
     observation: Observation
@@ -255,3 +273,5 @@ class Trace(eqx.Module):
     x: Float[Array, "*t n"] | None = None
     injection: Injection | None = None
     delay: int = eqx.field(static=True, default=0)
+    modes: tuple[str, ...] = eqx.field(static=True, default=())
+    named: tuple[str, ...] = eqx.field(static=True, default=())

@@ -10,6 +10,7 @@ import pytest
 from holdfast.catalog import ATTACKS, CONTROLLERS, DETECTORS, ESTIMATORS
 from holdfast.loop import Monitor, replay
 from holdfast.plants.build import linear_plant
+from holdfast.plants.library import swing
 from holdfast.records import Estimate, Observation
 from holdfast.shell.live import Live
 from holdfast.testing import check_attack, check_detector, check_estimator
@@ -45,6 +46,10 @@ PLANTS = {
     "actuator attack alone": walker(G=[[0.005], [0.1]], H=[[0.0]] * 3, attacks=["push"]),
     "no attack": walker(G=None, H=None, attacks=None),
 }
+SWITCHED = swing.network(
+    lines=[[1, 2], [2, 3]], generators=[1], attacks=["actuator:1"], switches=[["1-2"], ["2-3"]]
+)
+"""What works with no other plant runs on this one."""
 X0, P0 = np.array([0.3, -0.2]), np.array([[2.0, 0.3], [0.3, 1.0]])
 
 # What each kind is given beyond its defaults. A new entry of the catalog needs a line here.
@@ -53,6 +58,8 @@ ESTIMATOR_SETTINGS = {
     "unknown_input": {},
     "care": {},
     "extended": {},
+    "nise": {},
+    "nisme": {},
     "unscented": {},
     "decomposition": {},
     "secure_fusion": {"gamma": 2.0},
@@ -84,10 +91,12 @@ ATTACK_SETTINGS = {
     "stealthy": {"epsilon": 0.01},
     # from one channel of this plant nothing can hide; from these two a shift of the position can
     "zero_dynamics": {"size": 1.5, "channel": None, "channels": ["sensor:gps", "sensor:flow"]},
+    "switch": {"to": "1-2+2-3"},
 }
 CONTROLLER_SETTINGS = {
     "lqr": {"state_weight": [[1, 0], [0, 1]], "input_weight": [[1]]},
     "pole_placement": {"poles": [[0.6, 0.1], [0.6, -0.1]]},
+    "linearising": {},
 }
 
 
@@ -173,18 +182,24 @@ def test_attacks(kind, channel):
         return  # it names its own
     if kind == "stealthy" and not channel.startswith("sensor:"):
         return  # tests/attacks holds that these are refused
+    if kind == "switch":
+        if channel == "sensor:wheel":  # once: it has no channel
+            thrown = ATTACKS[kind](SWITCHED, start=0.1, stop=0.2, **ATTACK_SETTINGS[kind])
+            check_attack(thrown, SWITCHED)
+        return
     keys = {"channel": channel, "start": 1.0, "stop": 2.5, **ATTACK_SETTINGS[kind]}
     check_attack(ATTACKS[kind](PLANTS["both"], **keys), PLANTS["both"])
 
 
 @pytest.mark.parametrize("kind", CONTROLLER_SETTINGS)
 def test_controllers(kind):
-    plant = PLANTS["both"]
+    plant = SWITCHED if kind == "linearising" else PLANTS["both"]
     controller = CONTROLLERS[kind](plant, **CONTROLLER_SETTINGS[kind])
-    x = jnp.asarray([0.3, -0.2])
-    estimate = Estimate.without_attack(x, jnp.eye(2), jnp.zeros(3), jnp.eye(3), 0)
+    n, ny = len(plant.states), len(plant.outputs)
+    x = jnp.linspace(0.3, -0.2, n)
+    estimate = Estimate.without_attack(x, jnp.eye(n), jnp.zeros(ny), jnp.eye(ny), 0)
     command = controller.command(estimate)
-    assert command.shape == (1,)
+    assert command.shape == (len(plant.inputs),)
     assert np.all(np.isfinite(command))
 
 

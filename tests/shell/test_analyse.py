@@ -42,6 +42,15 @@ def test_json_has_what_others_rely_on(folder, command):
     assert attacks["channels"]["accel_attack"]["delay"] == 0
     assert (attacks["identified"], attacks["delay"], attacks["rank"]) == (True, 0, 1)
     assert attacks["bounded"][0]["attack"] == {"accel_attack": True}
+    assert found["modes"] == {
+        "all": 2,
+        "kept": [{"position": "normal", "attacks": ["accel_attack"], "samples": 1}],
+        "refused": [],
+        "confusable": [],
+        "local": False,
+        "reason": None,
+    }
+    # a Kalman filter assumes no mode
     assert found["advice"] == []
     assert found["window"] is None
     assert all(math.isfinite(number) for number in numbers(found))

@@ -30,7 +30,9 @@ class Window(Attack):
         """The injection of the attack inside, or zeros."""
         state, injection = self.attack.step(state, known)
         active = (self.first <= known.k) & (known.k < self.last)
-        return state, jax.tree.map(lambda added: jnp.where(active, added, 0.0), injection)
+        return state, jax.tree.map(
+            lambda added: jnp.where(active, added, jnp.zeros_like(added)), injection
+        )
 
 
 def active_steps(plant: Plant, start: float, stop: float) -> tuple[Int[Array, ""], Int[Array, ""]]:

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float
 from scipy.special import ndtri
 
 from holdfast.detectors.settings import by_dof, checked, no_channels, tested, verdict
+from holdfast.numerics.naming import sidak, z_values
 from holdfast.parts import Detector, Plant
 from holdfast.records import Estimate, Reason, Verdict
 
@@ -44,9 +45,7 @@ class PerChannel(Detector):
     ) -> tuple[Bool[Array, " 0"], Verdict]:
         """The verdict on one row, channel by channel."""
         v, cov = tested(estimate, self.on)
-        variance = jnp.diagonal(cov)
-        used = (variance > 0) & jnp.isfinite(variance)
-        z = jnp.where(used, jnp.abs(v) / jnp.sqrt(jnp.where(used, variance, 1.0)), 0.0)
+        z, used = z_values(v, jnp.diagonal(cov))
         statistic = jnp.max(z, initial=0.0)
         threshold = self.factor * self.table[jnp.sum(used)]
         codes = Reason.ATTACK_CHANNEL, Reason.RESIDUAL_CHANNEL
@@ -65,10 +64,9 @@ def build(
     A number is a limit on |z|. Raises `InvalidValue` for a setting out of range.
     """
     s = checked(plant, level, on, threshold)
-    tests = np.arange(1, s.most + 1)
-    each = np.full(s.most, s.level)
     if s.rule == "calibrated":
-        each = -np.expm1(np.log1p(-s.level) / tests)
-    table = -ndtri(each / 2.0) if s.rule != "given" else np.full(s.most, s.number)
+        table = sidak(s.level, s.most)
+    else:
+        table = np.full(s.most, s.number if s.rule == "given" else -ndtri(s.level / 2.0))
     one = jnp.asarray(1.0, float)
     return PerChannel(jnp.asarray(s.level, float), by_dof(table), one, s.on, s.rule)

@@ -42,17 +42,20 @@ class Kalman(Estimator):
         P = sandwich(m.A, state.P) + m.Q
         m = self.plant.at(k, x, u)
         W, _ = self.plant.whiten(m.R, observation.seen)
-        expected = dot(m.C, x) + dot(m.D, u)
-        return correct(KalmanState(k, x, P), m.C, m.R, W, expected, observation)
+        apart = observation.y - (dot(m.C, x) + dot(m.D, u))
+        return correct(KalmanState(k, x, P), m.C, m.R, W, apart, observation)
 
 
 def correct(
-    predicted: KalmanState, C, R, W, expected: Float[Array, " ny"], observation: Observation
+    predicted: KalmanState, C, R, W, apart: Float[Array, " ny"], observation: Observation
 ) -> tuple[KalmanState, Estimate]:
-    """Correct a prediction with what was seen; W whitens R there, C is h's (local) slope."""
+    """Correct a prediction by how far ``apart`` what was seen is from what was expected.
+
+    W whitens R where a sample is to be used and is 0 elsewhere, C is h's (local) slope.
+    """
     k, x, P = predicted.k, predicted.x, predicted.P
     seen = observation.seen
-    innovation = jnp.where(seen, observation.y - expected, 0.0)
+    innovation = jnp.where(seen, apart, 0.0)
     gain, P_new = absorb_known(P, dot(W, C))
     x = x + dot(gain, dot(W, innovation))
     both = seen[:, None] & seen[None, :]

@@ -80,7 +80,7 @@ class L1Kalman(Estimator):
             R = R + jnp.diag(e * e)
         cleaned = Observation(u, y, seen, observation.trusted, observation.status)
         W = self._whiten(R, seen, e)
-        after, estimate = correct(KalmanState(k, x, P), m.C, R, W, expected, cleaned)
+        after, estimate = correct(KalmanState(k, x, P), m.C, R, W, y - expected, cleaned)
         came = observation.seen[:, None] & observation.seen
         passed = int(Status.NOT_READY | Status.NOT_CONVERGED | Status.AMBIGUOUS)
         return L1KalmanState(after, decoding), Estimate.without_attack(

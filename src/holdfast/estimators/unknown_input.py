@@ -97,8 +97,10 @@ class UnknownInput(Estimator):
 
     ``direct`` marks the channels whose axis lies in the row space of H: they are given at
     k - L, the others at k - 1 - L (per step where H is). ``hidden``: some attack that moves
-    the state reaches no output of its own row. A nonlinear plant is linearised about the
-    estimates of the same row, again until they settle; NOT_CONVERGED where they do not.
+    the state reaches no output of its own row. ``active``: the channels that may be attacked;
+    the others are 0, with variance 0. A nonlinear plant is linearised about the estimates of
+    the same row, again until they settle, NOT_CONVERGED where they do not; or, unless
+    ``settle``, as NISE has it: f about the row before, h about the prediction.
     """
 
     plant: Plant
@@ -106,14 +108,16 @@ class UnknownInput(Estimator):
     P0: Float[Array, "n n"]
     direct: Bool[Array, "*t nd"]
     hidden: Bool[Array, "*t"]
+    active: Bool[Array, " nd"]
     delay: int = eqx.field(static=True)
+    settle: bool = eqx.field(static=True)
 
     def init(self) -> tuple[UnknownInputState, Estimate]:
         """The estimate one sample before the first row; the attacks up to there are free."""
         n, nd, ny, nu = self._sizes
         size = n + nd * (self.delay + 1)
         P = jnp.zeros((size, size)).at[:n, :n].set(self.P0)
-        unknown = jnp.concatenate([jnp.zeros(n, bool), jnp.ones(size + nd - n, bool)])
+        unknown = jnp.concatenate([jnp.zeros(n, bool), jnp.tile(self.active, self.delay + 2)])
         free = jnp.diag(jnp.where(unknown[:size], 1.0, 0.0))
         usual = None
         if isinstance(self.plant, LinearPlant) and self.plant.constant:
@@ -154,6 +158,8 @@ class UnknownInput(Estimator):
         k, status = state.k + 1, observation.status
         if isinstance(self.plant, LinearPlant):
             row = self._row(state, observation, None)
+        elif not self.settle:
+            row = self._predicted(state, observation)
         else:
             row, moving = self._relinearised(state, observation)
             status = status | jnp.where(moving, int(Status.NOT_CONVERGED), 0)
@@ -188,7 +194,8 @@ class UnknownInput(Estimator):
         P = sandwich(move, state.P)
         P = P + jnp.pad(m.Q, (0, P.shape[0] - n))
         s = sensing(self.plant, k, *((x, u, jnp.zeros(nd)) if at is None else (at.x, u, at.d)))
-        new = jnp.pad(_new_attack(s.H, trusted), ((n, P.shape[0] - n - nd), (0, 0)))
+        new = _new_attack(s.H, trusted, self.active)
+        new = jnp.pad(new, ((n, P.shape[0] - n - nd), (0, 0)))
         free = jnp.concatenate([dot(move, state.free), new], 1)
         H = jnp.where(trusted[:, None], 0.0, s.H)
         sense = jnp.pad(jnp.concatenate([s.C, H], 1), ((0, 0), (0, P.shape[0] - n - nd)))
@@ -198,7 +205,8 @@ class UnknownInput(Estimator):
         structure, settled, usual = _structure(state, whole, W, sense, free)
         M = dot(W, sense)
         update = absorb(P, M, free, structure.parts)
-        innovation = jnp.where(seen, observation.y - dot(s.C, x) - s.offset, 0.0)
+        expected = dot(s.C, x) + s.offset
+        innovation = jnp.where(seen, self.plant.innovation(observation.y, expected), 0.0)
         z = jnp.concatenate([x, jnp.zeros(nd), state.z[n:]])
         z = z + dot(update.gain, dot(W, innovation))
         blind = dot(W_inverse, update.blind)
@@ -212,6 +220,23 @@ class UnknownInput(Estimator):
             dot(dot(blind, W), innovation),
             sandwich(blind, spread),
         )
+
+    def _predicted(self, state: UnknownInputState, observation: Observation) -> _Row:
+        """The row with h linearised about the prediction, which takes in the attack before k.
+
+        That attack is found first, with h about the prediction without it: where h is linear
+        in what finds it (Assumption 4.1) the two agree.
+        """
+        n, nd, _, _ = self._sizes
+        k, u = state.k + 1, observation.u
+        x, d, none = state.z[:n], state.z[n : n + nd], jnp.zeros(nd)
+        first = _Point(x, d, self.plant.transition(k, x, u, d), none)
+        row = self._row(state, observation, first)
+        before = jnp.where(
+            row.structure.unknown[n + nd : n + 2 * nd], d, row.z[n + nd : n + 2 * nd]
+        )
+        at = _Point(x, d, self.plant.transition(k, x, u, before), none)
+        return self._row(state, observation, at)
 
     def _relinearised(
         self, state: UnknownInputState, observation: Observation
@@ -311,11 +336,18 @@ def build(plant: Plant, x0, P0, *, delay: int = 0) -> UnknownInput:
     """
     if delay < 0:
         raise InvalidValue("delay", delay, "a number of steps, 0 or more")
+    return restricted(plant, x0, P0, np.ones(len(plant.attacks), bool), delay)
+
+
+def restricted(
+    plant: Plant, x0, P0, active: np.ndarray, delay: int = 0, *, settle: bool = True
+) -> UnknownInput:
+    """The estimator that holds only the ``active`` channels for attacked."""
     x0, P0 = jnp.asarray(x0, float), jnp.asarray(P0, float)
     direct, hidden = (
-        jnp.asarray(f(plant, np.asarray(x0))) for f in (direct_channels, hidden_input)
+        jnp.asarray(f(plant, np.asarray(x0), active)) for f in (direct_channels, hidden_input)
     )
-    return UnknownInput(plant, x0, P0, direct, hidden, delay)
+    return UnknownInput(plant, x0, P0, direct, hidden, jnp.asarray(active), delay, settle)
 
 
 def _move(A, G, delay: int) -> Float[Array, "w s"]:
@@ -330,17 +362,17 @@ def _move(A, G, delay: int) -> Float[Array, "w s"]:
     )
 
 
-def _new_attack(H, trusted) -> Float[Array, "nd nd"]:
-    """The free directions of d_k: all, less what is authenticated.
+def _new_attack(H, trusted, active) -> Float[Array, "nd nd"]:
+    """The free directions of d_k: the active ones, less what is authenticated.
 
     A trusted output cannot have been attacked, so H d = 0 there, exactly.
     """
-    nd = H.shape[1]
-    rows = jnp.where(trusted[:, None], H, 0.0)
+    rows = jnp.where(trusted[:, None] & active, H, 0.0)
+    free = jnp.diag(active.astype(float))
     return jax.lax.cond(
         jnp.any(trusted),
-        lambda: leftover(jnp.eye(nd), split(rows, jnp.abs(rows))),
-        lambda: jnp.eye(nd),
+        lambda: leftover(free, split(rows, jnp.abs(rows))),
+        lambda: free,
     )
 
 

@@ -20,6 +20,8 @@ class Unscented(Estimator):
     exact, fourth moments of a Gaussian matched where n <= 3. The correction regresses h on the
     sigma points: y = h_mean + S xi + e with x = x_pred + F xi; the spread of e that h's
     curvature leaves is added to R, and the row is absorbed as in `Kalman`, in Joseph's form.
+    Outputs are compared by `Plant.innovation`: the mean of an angle is taken about that of the
+    centre, which is right while the sigma points stay within half a turn of it.
     On a linear plant this is `Kalman`.
 
     Source: Julier and Uhlmann (2004), symmetric set.
@@ -44,10 +46,12 @@ class Unscented(Estimator):
         P = symmetric(dot(slope, slope.T)) + rest + Q
         factor = psd_factor(P)
         _, R = self.plant.noise(k, x, u)
-        mean, slope, rest = regress(lambda x: self.plant.output(k, x, u, none), x, factor)
+        mean, slope, rest = regress(
+            lambda x: self.plant.output(k, x, u, none), x, factor, self.plant.innovation
+        )
         spread = R + rest
         W, _ = whitener(spread, seen)
-        innovation = jnp.where(seen, observation.y - mean, 0.0)
+        innovation = jnp.where(seen, self.plant.innovation(observation.y, mean), 0.0)
         gain, cov = absorb_known(jnp.eye(x.shape[0]), dot(W, slope))
         x = x + dot(factor, dot(gain, dot(W, innovation)))
         P_new = sandwich(factor, cov)
@@ -57,22 +61,23 @@ class Unscented(Estimator):
         return KalmanState(k, x, P_new), estimate
 
 
-def regress(function, x: Float[Array, " n"], factor: Float[Array, "n n"]):
+def regress(function, x: Float[Array, " n"], factor: Float[Array, "n n"], apart=lambda a, b: a - b):
     """Mean of function(x + F xi), xi ~ (0, I), its slope on xi, and the spread about that line.
 
     slope_i = (f_i+ - f_i-) / (2 c); the spread is the sigma points' covariance less
-    slope slope': that of the even parts alone, positive semidefinite.
+    slope slope': that of the even parts alone, positive semidefinite. ``apart(a, b)`` is what
+    takes values of the function from each other.
     """
     n = x.shape[0]
     c = math.sqrt(max(n, 3))
     steps = c * factor.T
-    plus = jax.vmap(lambda s: function(x + s))(steps)
-    minus = jax.vmap(lambda s: function(x - s))(steps)
     centre = function(x)
+    plus = jax.vmap(lambda s: apart(function(x + s), centre))(steps)
+    minus = jax.vmap(lambda s: apart(function(x - s), centre))(steps)
     weight = 1.0 / (2.0 * c * c)
     slope = (plus - minus).T / (2.0 * c)
     # second differences: twice the even part of the function at each pair of sigma points
-    bend = plus + minus - 2.0 * centre
+    bend = plus + minus
     shift = weight * jnp.sum(bend, 0)
     even = 0.5 * bend
     rest = 2.0 * weight * dot(even.T, even) - shift[:, None] * shift

@@ -128,6 +128,14 @@ def solve_lower(
     return jnp.stack(found) if found else b
 
 
+def solve_upper(lower: Float[Array, "n n"], b: Float[Array, "n *m"]) -> Float[Array, "n *m"]:
+    """X with L' X = b, for a lower L of full rank."""
+    n = lower.shape[0]
+    if n > SMALL:
+        return jax.scipy.linalg.solve_triangular(lower, b, lower=True, trans=1)
+    return dot(solve_lower(lower, jnp.ones(n, bool), jnp.eye(n)).T, b)
+
+
 def mahalanobis(
     v: Float[Array, " n"], cov: Float[Array, "n n"]
 ) -> tuple[Float[Array, ""], Int[Array, ""]]:

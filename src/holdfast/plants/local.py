@@ -38,8 +38,8 @@ def motion(plant: Plant, k, x, u, d) -> Motion:
         m = plant.at(k, x, u)
         return Motion(m.A, m.G, m.Q, dot(m.B, u))
     Q, _ = plant.noise(k, x, u)
-    A, G, offset = _tangent(lambda x, d: plant.transition(k, x, u, d), x, d)
-    return Motion(A, G, Q, offset)
+    A, G = plant.jacobian(k, x, u, d)
+    return Motion(A, G, Q, plant.transition(k, x, u, d) - dot(A, x) - dot(G, d))
 
 
 def sensing(plant: Plant, k, x, u, d) -> Sensing:
@@ -48,10 +48,5 @@ def sensing(plant: Plant, k, x, u, d) -> Sensing:
         m = plant.at(k, x, u)
         return Sensing(m.C, m.H, m.R, dot(m.D, u))
     _, R = plant.noise(k, x, u)
-    C, H, offset = _tangent(lambda x, d: plant.output(k, x, u, d), x, d)
-    return Sensing(C, H, R, offset)
-
-
-def _tangent(function, x, d):
-    by_x, by_d = jax.jacfwd(function, argnums=(0, 1))(x, d)
-    return by_x, by_d, function(x, d) - dot(by_x, x) - dot(by_d, d)
+    C, H = jax.jacfwd(lambda x, d: plant.output(k, x, u, d), argnums=(0, 1))(x, d)
+    return Sensing(C, H, R, plant.output(k, x, u, d) - dot(C, x) - dot(H, d))

@@ -9,6 +9,8 @@ import rich.table
 
 from holdfast.analysis.advice import advice
 from holdfast.analysis.fusion import Fusion, Remedy
+from holdfast.analysis.mode_advice import on_modes
+from holdfast.analysis.modes import Reduction, reduce
 from holdfast.analysis.whole import Analysis, analysis
 from holdfast.analysis.wording import between
 from holdfast.analysis.zeros import Zero
@@ -29,12 +31,15 @@ from holdfast.shell.decoding_content import (
     named,
     ratio,
 )
+from holdfast.shell.modes_content import MOST, STEPS, modes_content, modes_table
 from holdfast.shell.scenario import read_scenario
 
 FUSING = ("decomposition", "secure_fusion")
 """Estimators that fuse local estimates."""
 DECODING = ("l1_decoder", "l1_kalman")
 """Estimators that decode a window of samples."""
+WEIGHING = ("nise", "nisme")
+"""Estimators that assume a set of attacked channels, or weigh several."""
 
 
 def analyse(scenario: str, compromised: str | None, as_json: bool, allow_python: bool) -> None:
@@ -48,13 +53,18 @@ def analyse(scenario: str, compromised: str | None, as_json: bool, allow_python:
     altered = compromised_outputs(compromised, found.plant.outputs)
     with busy("analysing the plant"):
         result = analysis(found.plant, x0, P0, **_decoder(found), compromised=altered)
+        modes = reduce(found.plant, x0, STEPS, most=MOST)
     about = _about(found, altered is not None)
     delay = getattr(found.monitor.estimator, "delay", None)
     sentences = advice(result, delay, **about)
+    weighed = _kind(found) in WEIGHING or len(found.plant.positions) > 1
+    if weighed:
+        sentences += on_modes(modes)
     if as_json:
-        print(json.dumps(content(result, sentences), allow_nan=False, indent=1))
+        shown = content(result, sentences) | {"modes": modes_content(modes)}
+        print(json.dumps(shown, allow_nan=False, indent=1))
     else:
-        _print(result, sentences, **about)
+        _print(result, sentences, modes if weighed else None, **about)
 
 
 def _start(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
@@ -192,7 +202,12 @@ def _pair(value: complex) -> list[float]:
 
 
 def _print(
-    found: Analysis, sentences: list[str], fusion: bool, decoding: bool, stealth: bool
+    found: Analysis,
+    sentences: list[str],
+    modes: Reduction | None,
+    fusion: bool,
+    decoding: bool,
+    stealth: bool,
 ) -> None:
     console = rich.console.Console()
     table = rich.table.Table(show_header=False, box=None, pad_edge=False)
@@ -207,6 +222,8 @@ def _print(
         console.print(decoders_table(found.decoding.correctable))
     if stealth and found.attackable.reason is None:
         console.print(attackable_table(found.attackable))
+    if modes is not None and modes.reason is None:
+        console.print(modes_table(modes))
     for sentence in sentences:
         console.print(f"- {sentence}", markup=False, highlight=False, soft_wrap=True)
 

@@ -99,6 +99,20 @@ def _places(path: str | Path, time: np.ndarray, dt: float) -> np.ndarray:
     return place.astype(int)
 
 
+def nearest_samples(
+    time: np.ndarray, first: float, rows: int, dt: float
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Of samples at ``time`` the one nearest to each row of a grid: which rows have one, which
+    samples those are, and how many samples lay within half a row of any.
+    """
+    row = np.rint((time - first) / dt).astype(int)
+    candidates = np.flatnonzero((row >= 0) & (row < rows))
+    distance = np.abs(time - first - dt * row)
+    nearest_first = candidates[np.lexsort((distance[candidates], row[candidates]))]
+    taken, which = np.unique(row[nearest_first], return_index=True)
+    return taken, nearest_first[which], len(candidates)
+
+
 def _held(u: np.ndarray, sent: np.ndarray) -> np.ndarray:
     """Inputs that were not sent hold the last finite value before them; 0 before the first."""
     known = sent & np.isfinite(u)

@@ -1,7 +1,9 @@
 """A scenario file, from TOML to parts that have been built and checked."""
 
 import dataclasses
+import functools
 import importlib
+import inspect
 import re
 import sys
 import tomllib
@@ -124,7 +126,7 @@ def _plant(table: Table, allow_python: bool) -> Plant:
             f"{target!r}, which would run Python code",
             "--allow-python on the command line, if you trust this scenario",
         )
-    plant = table.built(_imported(table, target))
+    plant = table.built(_told_as_target(_imported(table, target)))
     if not isinstance(plant, Plant):
         raise table.error("target", f"a function that returns {type(plant).__name__}", "a Plant")
     return plant
@@ -136,15 +138,40 @@ def _imported(table: Table, target: str) -> Callable[..., Any]:
     sys.path.insert(0, str(table.folder.resolve()))
     try:
         found = getattr(importlib.import_module(module), name, None)
-    except ImportError as error:
+    except Exception as error:
         raise table.error(
-            "target", f"{target!r} ({error})", "a module that can be imported"
+            "target", f"{target!r} ({_in_short(error)})", "a module that can be imported"
         ) from None
     finally:
         sys.path.pop(0)
     if not callable(found):
         raise table.error("target", f"{target!r}", f"a function {name!r} in {module}")
     return found
+
+
+def _told_as_target(make: Callable[..., Any]) -> Callable[..., Any]:
+    """``make`` whose errors about anything but its own settings are errors of its target."""
+    settings = inspect.signature(make).parameters
+
+    @functools.wraps(make)
+    def told(**values):
+        try:
+            return make(**values)
+        except InvalidValue as error:
+            if error.key in settings:
+                raise
+            found = f"{error.key}: {error.found}"
+            raise InvalidValue("target", found, error.expected) from None
+        except Exception as error:
+            raise InvalidValue(
+                "target", _in_short(error), "a function that returns a Plant"
+            ) from None
+
+    return told
+
+
+def _in_short(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}".splitlines()[0]
 
 
 def _part(

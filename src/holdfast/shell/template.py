@@ -22,6 +22,9 @@ KINDS = {
 }
 """What a template has unless it is asked for something else."""
 
+NEEDS = {"switch": "swing", "linearising": "swing"}
+"""The plant of those that do not work with a linear one."""
+
 REQUIRED = {
     "epsilon": 0.001,
     "value": 3.0,
@@ -73,6 +76,15 @@ EXAMPLES: dict[str, dict[str, Any]] = {
         "x0": [2.0, 2.5, 0.0, 10.0],
         "channel": "channel:accel_attack",
     },
+    "swing": {
+        "plant": {
+            "lines": [[1, 2], [2, 3], [3, 1]],
+            "generators": [1],
+            "attacks": ["actuator:1", "sensor:P_elec:2"],
+            "switches": [["1-2"]],
+        },
+    },
+    "unicycle": {"plant": {"landmarks": [[4.0, 1.0], [1.0, 5.0], [-3.0, 2.0], [2.0, -4.0]]}},
 }
 """What suits a plant better than zeros: where it starts, and what to attack."""
 
@@ -98,6 +110,7 @@ def scenario_text(kind: str | None) -> str:
             known = [name for parts in SECTIONS.values() for name in parts]
             raise InputError("new", "KIND", repr(kind), one_of(known, kind))
         kinds[section] = kind
+        kinds["plant"] = NEEDS.get(kind, kinds["plant"])
     build = SECTIONS["plant"][kinds["plant"]]
     example = EXAMPLES.get(kinds["plant"], {})
     plant_text = LINEAR
@@ -166,9 +179,11 @@ def _injection(
         target = channel or f"channel:{plant.attacks[0]}"
     if pushes:
         target = f"actuator:{plant.inputs[0]}"
-    needed = {name: REQUIRED[name] for name in fields if name in REQUIRED}
+    known = REQUIRED | {"to": plant.positions[-1]}
+    needed = {name: known[name] for name in fields if name in known}
+    where = {"channel": target} if "channel" in fields else {}
     begin = 100 * plant.dt
-    return {"channel": target, "start": begin, "stop": 2 * begin, **needed}
+    return {**where, "start": begin, "stop": 2 * begin, **needed}
 
 
 def _table(

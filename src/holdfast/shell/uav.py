@@ -13,7 +13,7 @@ from holdfast.parts import Plant
 from holdfast.plants.library.uav import GPS
 from holdfast.records import Observation
 from holdfast.shell.errors import InputError, one_of, shown
-from holdfast.shell.grid import Log
+from holdfast.shell.grid import Log, nearest_samples
 from holdfast.shell.topics import Topic, read_topics
 
 GPS_TOPIC, BARO_TOPIC = "vehicle_gps_position", "vehicle_air_data"
@@ -206,19 +206,17 @@ def _match(
     """The samples of one sensor in the rows nearest to them: y, seen and what became of all."""
     y = np.zeros((len(rows), values.shape[1]))
     seen = np.zeros(y.shape, bool)
-    row = np.rint((time - rows[0]) / dt).astype(int)
-    distance = np.abs(time - rows[0] - dt * row)
+    off = np.abs(time - rows[0] - dt * np.rint((time - rows[0]) / dt))
     fixed = usable.any(1)
     # half a microsecond: a sample exactly between two rows belongs to one of them
-    late = fixed & (distance > tolerance + 0.5 / SECOND)
-    candidates = np.flatnonzero(fixed & ~late & (row >= 0) & (row < len(rows)))
-    nearest_first = candidates[np.lexsort((distance[candidates], row[candidates]))]
-    taken, which = np.unique(row[nearest_first], return_index=True)
-    chosen = nearest_first[which]
+    late = fixed & (off > tolerance + 0.5 / SECOND)
+    in_time = np.flatnonzero(fixed & ~late)
+    taken, which, candidates = nearest_samples(time[in_time], rows[0], len(rows), dt)
+    chosen = in_time[which]
     y[taken], seen[taken] = np.where(usable[chosen], values[chosen], 0.0), usable[chosen]
     count = Count(
         used=len(chosen),
-        duplicate=len(candidates) - len(chosen),
+        duplicate=candidates - len(chosen),
         late=int(late.sum()),
         without_fix=int((~fixed).sum()),
         missing=_missing(time[fixed]),

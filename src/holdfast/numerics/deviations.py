@@ -1,0 +1,162 @@
+"""Filters that differ from one another in a few unknown inputs, as corrections of one filter.
+
+A filter that knows of no attack has P after the row, gain K, and whitened innovations e = T nu
+(`holdfast.numerics.innovations`). One that leaves r directions of attack wholly free has, at
+every row, the covariance P + Z Z' with a Z of few columns, and its innovation is
+
+    nu = C e + Y_z z + F delta + v,        z ~ (0, I) what its state is uncertain beyond P,
+
+delta the attack of this row, without prior. With X the columns that the same z and delta add
+to the state, everything follows from P's own U and T and small matrices: let B = T [Y_z, F],
+
+    I + B_z'B_z = L L',   R = L^-1 B_z'B_f,   D = [B_z L^-T, B_f - B_z L^-T R],
+    Sigma = D_f'D_f + |L^-T R|^2   (the information about delta: F' S^-1 F, S this filter's),
+    delta^ = Sigma^-1 D_f'e,     x^ = x^_0 + U e + X_z D_z'e + X_f delta^,
+    Z+ = [X_z, X_f Sigma^-1/2],  X <- X - U T Y, mixed like D.
+
+No inverse of the large S beyond the one that all share; nothing is subtracted from P.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Bool, Float
+
+from holdfast.numerics.linalg import SMALL, dot, lower_factor, solve_lower, solve_upper, symmetric
+from holdfast.numerics.square_root import triangle
+
+INSEPARABLE = 1e-5
+"""Share of a column's effect that must be its own: its square is far above rounding. Below it
+directions of attack count as indistinguishable at this row."""
+
+
+class Deviation(NamedTuple):
+    """What a filter does beyond the common one, whatever is measured at the row.
+
+    ``scores`` D (p x c): D'e; ``moves`` X (n x c); ``root`` of Sigma (r x r), with unit
+    information added where a direction is ``unknown``: this row cannot tell it. ``prior``:
+    of Sigma + I, the attack being N(0, I) beforehand. ``log_det``: log |I + B_z'B_z|;
+    ``log_free``: log of |Sigma| / |F'F| over the directions that are known.
+    """
+
+    scores: Float[Array, "p c"]
+    moves: Float[Array, "n c"]
+    root: Float[Array, "r r"]
+    prior: Float[Array, "r r"]
+    unknown: Bool[Array, " r"]
+    log_det: Float[Array, ""]
+    log_free: Float[Array, ""]
+
+
+def deviation(
+    white: Float[Array, "p p"],
+    common: Float[Array, "n p"],
+    X: Float[Array, "n c"],
+    Y: Float[Array, "p c"],
+    r: int,
+) -> Deviation:
+    """The deviation whose last ``r`` columns are attacks and whose others are uncertainty.
+
+    ``white``, ``common``: T and U of the filter that all share.
+    X, Y: what each column adds to the predicted state and to the measurement (zero rows where
+    nothing was seen).
+    """
+    z = X.shape[1] - r
+    B = dot(white, Y)
+    X = X - dot(common, B)
+    uncertain, attacked = B[:, :z], B[:, z:]
+    lower = _positive_factor(jnp.eye(z) + _gram(uncertain, uncertain))
+    R = _forward(lower, _gram(uncertain, attacked))
+    D_z, X_z = _backward(lower, uncertain), _backward(lower, X[:, :z])
+    D_f, X_f = attacked - dot(D_z, R), X[:, z:] - dot(X_z, R)
+    rest = solve_upper(lower, R)
+    Sigma = symmetric(_gram(D_f, D_f) + _gram(rest, rest))
+    unknown = inseparable(Sigma, jnp.sum(attacked * attacked, 0))
+    # unit information, or as much as the factor of a number 1e10 times larger can hold
+    added = jnp.maximum(1.0, 1e-8 * jnp.diagonal(Sigma))
+    root = lower_factor(Sigma + jnp.diag(jnp.where(unknown, added, 0.0)))[0]
+    prior, found = lower_factor(Sigma + jnp.eye(r))
+    prior = prior + jnp.diag(jnp.where(found, 0.0, 1.0))
+    F = jnp.where(unknown, 0.0, Y[:, z:])
+    size = lower_factor(_gram(F, F) + jnp.diag(jnp.where(unknown, 1.0, 0.0)))[0]
+    known = jnp.where(unknown, 1.0, jnp.diagonal(root) / jnp.diagonal(size))
+    return Deviation(
+        jnp.concatenate([D_z, D_f], 1),
+        jnp.concatenate([X_z, X_f], 1),
+        root,
+        prior,
+        unknown,
+        2.0 * jnp.sum(jnp.log(jnp.diagonal(lower))),
+        2.0 * jnp.sum(jnp.log(known)),
+    )
+
+
+def inseparable(Sigma: Float[Array, "r r"], size: Float[Array, " r"]) -> Bool[Array, " r"]:
+    """Which directions the information matrix does not tell, or not from one another.
+
+    ``size``: the information each would have if all else were known.
+    """
+    r = Sigma.shape[0]
+    unit = jnp.where(size > 0, 1.0 / jnp.sqrt(jnp.where(size > 0, size, 1.0)), 0.0)
+    scaled = unit[:, None] * Sigma * unit[None, :]
+    # a column without any effect is a combination of none of the others
+    lower, independent = lower_factor(scaled)
+    weak = jnp.diagonal(lower) < INSEPARABLE
+    kept = independent & ~weak & (size > 0)
+    lower = jnp.where(kept[None, :], lower, 0.0)
+    inverse = solve_lower(lower, kept, jnp.eye(r))
+    partners = jnp.where(kept[:, None], 0.0, dot(lower, inverse))
+    return ~kept | jnp.any(jnp.abs(partners) > INSEPARABLE, 0)
+
+
+def after(
+    moves: Float[Array, "n c"], root: Float[Array, "r r"], carried: Bool[Array, " r"], q: int
+) -> Float[Array, "m c"]:
+    """The factor of what is uncertain after the row, of the state and of the ``q`` last attacks.
+
+    Those of them that are ``carried`` have been found and go on into the next row's motion.
+    """
+    r = root.shape[0]
+    spread = _backward(root, jnp.eye(r))
+    z = moves.shape[1] - r
+    state = jnp.concatenate([moves[:, :z], dot(moves[:, z:], spread)], 1)
+    attacks = jnp.where(carried[:, None], spread, 0.0)[r - q :]
+    return jnp.concatenate([state, jnp.pad(attacks, ((0, 0), (z, 0)))])
+
+
+def shortened(Z: Float[Array, "m c"], columns: int) -> tuple[Float[Array, "m q"], Float[Array, ""]]:
+    """Z with ``columns`` columns and the same Z Z', and the share of its trace that is lost.
+
+    Exact where ``columns`` >= m; else the largest principal parts of Z Z' are kept.
+    """
+    m, c = Z.shape
+    if columns >= c:
+        return jnp.pad(Z, ((0, 0), (0, columns - c))), jnp.asarray(0.0)
+    if columns >= m:
+        return jnp.pad(triangle(Z.T).T, ((0, 0), (0, columns - m))), jnp.asarray(0.0)
+    values, vectors = jnp.linalg.eigh(_gram(Z, Z))
+    total = jnp.sum(values)
+    lost = jnp.sum(jnp.maximum(values[: c - columns], 0.0))
+    return Z @ vectors[:, c - columns :], lost / jnp.where(total > 0, total, 1.0)
+
+
+def _gram(a, b):
+    return dot(a.T, b)
+
+
+def _positive_factor(p):
+    """L with P = L L' for a P that is at least the identity."""
+    return lower_factor(p)[0] if p.shape[0] <= SMALL else jnp.linalg.cholesky(p)
+
+
+def _forward(lower, b):
+    """L^-1 b."""
+    if lower.shape[0] <= SMALL:
+        return solve_lower(lower, jnp.ones(lower.shape[0], bool), b)
+    return solve_triangular(lower, b, lower=True)
+
+
+def _backward(lower, a):
+    """A L^-T."""
+    return _forward(lower, a.T).T
