@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from holdfast.numerics.blue import whitener
 from holdfast.numerics.deviations import Deviation, after, deviation, shortened
 from holdfast.numerics.innovations import Correction, correction
-from holdfast.numerics.linalg import SMALL, dot, sandwich, solve_lower, solve_upper
+from holdfast.numerics.linalg import SMALL, dot, lower_inverse, sandwich
 from holdfast.parts import Plant
 from holdfast.plants.linear import LinearPlant
 from holdfast.plants.local import motion, sensing
@@ -194,14 +194,14 @@ def _fitted(own: Deviation, x, e):
     """One filter: state, attacks, and the parts of its log-likelihoods that are its own."""
     r, scores = own.root.shape[0], dot(own.scores.T, e)
     z, f = jnp.split(scores, [scores.shape[0] - r])
-    every = jnp.ones(r, bool)
-    half, before = solve_lower(own.root, every, f), solve_lower(own.prior, every, f)
-    delta = solve_upper(own.root, half)
+    inverse = lower_inverse(own.root)
+    half, before = dot(inverse, f), dot(lower_inverse(own.prior), f)
+    delta = dot(inverse.T, half)
     x = x + dot(own.moves, jnp.concatenate([z, delta]))
     rest = dot(e, e) - dot(z, z)
     blind = rest - dot(half, half)
     size = 2.0 * jnp.sum(jnp.log(jnp.diagonal(own.prior)))
     evidence = -0.5 * (rest - dot(before, before) + own.log_det + size)
-    rank = jnp.sum(~own.unknown).astype(float)
+    rank = jnp.sum(~own.dependent).astype(float)
     paper = -0.5 * (blind + own.log_det + own.log_free - rank * jnp.log(2.0 * jnp.pi))
     return x, delta, evidence, paper, -0.5 * blind

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from holdfast.estimators import bank
-from holdfast.numerics.linalg import RANK_TOLERANCE, dot, sandwich, solve_upper
+from holdfast.numerics.linalg import RANK_TOLERANCE, dot, lower_inverse, sandwich
 from holdfast.numerics.naming import named
 from holdfast.parts import Plant, no_attack
 from holdfast.plants.constraints import limits_of
@@ -49,28 +49,31 @@ class One(NamedTuple):
     residual_cov: Float[Array, "p p"]
 
 
-def one(uses: bank.Uses, gain: bank.Gains, fit: bank.Fit, place, scale) -> One:
-    """The filter at ``place`` (group, place in it); ``uses`` and ``gain`` of its group."""
+def one(uses: bank.Uses, gains: bank.Gains, fit: bank.Fit, place, scale) -> One:
+    """The filter at ``place`` (group, place in it) of the bank.
+
+    Taken out array by array: of a whole group they would be megabytes.
+    """
     s, j = place[0], place[1]
-    use = bank.Uses(uses.before[j], uses.before_on[j], uses.now[j], uses.now_on[j])
-    root, columns, moves = gain.own.root[j], gain.columns[j], gain.own.moves[j]
+    use = bank.Uses(*(v[s, j] for v in (uses.before, uses.before_on, uses.now, uses.now_on)))
+    root, columns, moves = (v[s, j] for v in (gains.own.root, gains.columns, gains.own.moves))
     r = root.shape[0]
     z = moves.shape[1] - r
-    told, spread = ~gain.own.unknown[j], solve_upper(root, jnp.eye(r))
+    told, spread = ~gains.own.unknown[s, j], lower_inverse(root).T
     uncertain = jnp.concatenate([moves[:, :z], dot(moves[:, z:], spread)], 1)
-    F = jnp.where(told, columns[:, z:], 0.0)
-    whole = gain.spread + _square(columns[:, :z])
+    F = columns[:, z:]
+    whole = gains.spread[s] + _square(columns[:, :z])
     residual_cov = _cleared(whole - _square(dot(F, spread)), whole)
     residual = fit.innovation[s, j] - dot(F, fit.attack[s, j])
     unit = scale[jnp.concatenate([use.before, use.now])]
     return One(
         use,
         fit.x[s, j],
-        gain.common.cov + _square(uncertain),
+        gains.common.cov[s] + _square(uncertain),
         fit.attack[s, j] * unit,
         spread * unit[:, None],
         told,
-        gain.held[j],
+        gains.held[s, j],
         jnp.where(jnp.diagonal(residual_cov) > 0, residual, 0.0),
         residual_cov,
     )

@@ -99,7 +99,7 @@ class Nisme(Estimator):
         columns = full if alone else min(full, WIDTH * (a + b))
         P = jnp.broadcast_to(self.P0, (s, n, n))
         cov = Covariances(self.group.uses.before_on, P, jnp.zeros((s, j, full, columns)))
-        even = jnp.full(len(self.modes), -math.log(len(self.modes)))
+        even = jnp.full(len(self.modes), -math.log(len(self.modes)), float)
         kept = cov
         if self.freeze:
             nothing = Observation.of(
@@ -134,11 +134,9 @@ class Nisme(Estimator):
         d = jnp.where(told, fitted.attack[..., uses.before.shape[-1] :], 0.0)
         after = NismeState(k, Means(fitted.x, d), log_p, kept)
         mode = jnp.argmax(log_p).astype(jnp.int32)
-        place = self.places[mode]
-        uses, gain = (jax.tree.map(lambda leaf: leaf[place[0]], t) for t in (uses, gains))
-        believed = one(uses, gain, fitted, place, self.scale)
+        believed = one(uses, gains, fitted, self.places[mode], self.scale)
         status = observation.status | jnp.where(self.hidden, int(Status.HIDDEN_INPUT), 0)
-        status = status | jnp.where(gain.lost > LOST, int(Status.NOT_CONVERGED), 0)
+        status = status | jnp.where(jnp.max(gains.lost) > LOST, int(Status.NOT_CONVERGED), 0)
         estimate = record(
             self.plant, k, observation, mode, believed, self.sets, self.hypotheses, status
         )
@@ -231,7 +229,7 @@ def build(
     if not 0.0 <= freeze < 1.0:
         raise InvalidValue("freeze", freeze, "a part of a standard deviation, 0 for never")
     found = reach(plant, np.asarray(x0), [m.position for m in run], [m.active for m in run])
-    falsified = max(int(np.sum(np.asarray(m.active) & found.sensed)) for m in run)
+    falsified = max(int(np.sum(np.asarray(m.active, bool) & found.sensed)) for m in run)
     slots = arranged(run, found.moving, found.sensed, len(x0) + falsified > SMALL)
     places = np.zeros((len(run), 2), np.int32)
     places[slots.modes[slots.real]] = np.argwhere(slots.real)

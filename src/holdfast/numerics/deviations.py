@@ -20,10 +20,9 @@ No inverse of the large S beyond the one that all share; nothing is subtracted f
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
-from holdfast.numerics.linalg import SMALL, dot, lower_factor, solve_lower, solve_upper, symmetric
+from holdfast.numerics.linalg import dot, lower_factor, lower_inverse, one_at_a_time, symmetric
 from holdfast.numerics.square_root import triangle
 
 INSEPARABLE = 1e-5
@@ -35,15 +34,17 @@ class Deviation(NamedTuple):
     """What a filter does beyond the common one, whatever is measured at the row.
 
     ``scores`` D (p x c): D'e; ``moves`` X (n x c); ``root`` of Sigma (r x r), with unit
-    information added where a direction is ``unknown``: this row cannot tell it. ``prior``:
-    of Sigma + I, the attack being N(0, I) beforehand. ``log_det``: log |I + B_z'B_z|;
-    ``log_free``: log of |Sigma| / |F'F| over the directions that are known.
+    information added about a ``dependent`` direction: one whose effect is none, or that of a
+    combination of directions before it, which stay free. ``unknown``: those, and all in such a
+    combination. ``prior``: of Sigma + I, the attack being N(0, I) beforehand. ``log_det``:
+    log |I + B_z'B_z|; ``log_free``: log of |Sigma| / |F'F| over what is not dependent.
     """
 
     scores: Float[Array, "p c"]
     moves: Float[Array, "n c"]
     root: Float[Array, "r r"]
     prior: Float[Array, "r r"]
+    dependent: Bool[Array, " r"]
     unknown: Bool[Array, " r"]
     log_det: Float[Array, ""]
     log_free: Float[Array, ""]
@@ -66,48 +67,52 @@ def deviation(
     B = dot(white, Y)
     X = X - dot(common, B)
     uncertain, attacked = B[:, :z], B[:, z:]
-    lower = _positive_factor(jnp.eye(z) + _gram(uncertain, uncertain))
-    R = _forward(lower, _gram(uncertain, attacked))
-    D_z, X_z = _backward(lower, uncertain), _backward(lower, X[:, :z])
+    lower = lower_factor(jnp.eye(z) + _gram(uncertain, uncertain))[0]
+    inverse = lower_inverse(lower)
+    R = dot(inverse, _gram(uncertain, attacked))
+    D_z, X_z = dot(uncertain, inverse.T), dot(X[:, :z], inverse.T)
     D_f, X_f = attacked - dot(D_z, R), X[:, z:] - dot(X_z, R)
-    rest = solve_upper(lower, R)
+    rest = dot(inverse.T, R)
     Sigma = symmetric(_gram(D_f, D_f) + _gram(rest, rest))
-    unknown = inseparable(Sigma, jnp.sum(attacked * attacked, 0))
+    dependent, unknown = inseparable(Sigma, jnp.sum(attacked * attacked, 0))
     # unit information, or as much as the factor of a number 1e10 times larger can hold
     added = jnp.maximum(1.0, 1e-8 * jnp.diagonal(Sigma))
-    root = lower_factor(Sigma + jnp.diag(jnp.where(unknown, added, 0.0)))[0]
+    root = lower_factor(Sigma + jnp.diag(jnp.where(dependent, added, 0.0)))[0]
     prior, found = lower_factor(Sigma + jnp.eye(r))
     prior = prior + jnp.diag(jnp.where(found, 0.0, 1.0))
-    F = jnp.where(unknown, 0.0, Y[:, z:])
-    size = lower_factor(_gram(F, F) + jnp.diag(jnp.where(unknown, 1.0, 0.0)))[0]
-    known = jnp.where(unknown, 1.0, jnp.diagonal(root) / jnp.diagonal(size))
+    F = jnp.where(dependent, 0.0, Y[:, z:])
+    size = lower_factor(_gram(F, F) + jnp.diag(jnp.where(dependent, 1.0, 0.0)))[0]
+    known = jnp.where(dependent, 1.0, jnp.diagonal(root) / jnp.diagonal(size))
     return Deviation(
         jnp.concatenate([D_z, D_f], 1),
         jnp.concatenate([X_z, X_f], 1),
         root,
         prior,
+        dependent,
         unknown,
         2.0 * jnp.sum(jnp.log(jnp.diagonal(lower))),
         2.0 * jnp.sum(jnp.log(known)),
     )
 
 
-def inseparable(Sigma: Float[Array, "r r"], size: Float[Array, " r"]) -> Bool[Array, " r"]:
-    """Which directions the information matrix does not tell, or not from one another.
+def inseparable(
+    Sigma: Float[Array, "r r"], size: Float[Array, " r"]
+) -> tuple[Bool[Array, " r"], Bool[Array, " r"]]:
+    """Which directions depend on those before them, and which are in such a combination too:
+    the information matrix does not tell them, or not from one another.
 
     ``size``: the information each would have if all else were known.
     """
-    r = Sigma.shape[0]
     unit = jnp.where(size > 0, 1.0 / jnp.sqrt(jnp.where(size > 0, size, 1.0)), 0.0)
     scaled = unit[:, None] * Sigma * unit[None, :]
     # a column without any effect is a combination of none of the others
     lower, independent = lower_factor(scaled)
     weak = jnp.diagonal(lower) < INSEPARABLE
     kept = independent & ~weak & (size > 0)
-    lower = jnp.where(kept[None, :], lower, 0.0)
-    inverse = solve_lower(lower, kept, jnp.eye(r))
+    lower = jnp.where(kept, lower, 0.0)
+    inverse = lower_inverse(lower + jnp.diag(jnp.where(kept, 0.0, 1.0)))
     partners = jnp.where(kept[:, None], 0.0, dot(lower, inverse))
-    return ~kept | jnp.any(jnp.abs(partners) > INSEPARABLE, 0)
+    return ~kept, ~kept | jnp.any(jnp.abs(partners) > INSEPARABLE, 0)
 
 
 def after(
@@ -118,7 +123,7 @@ def after(
     Those of them that are ``carried`` have been found and go on into the next row's motion.
     """
     r = root.shape[0]
-    spread = _backward(root, jnp.eye(r))
+    spread = lower_inverse(root).T
     z = moves.shape[1] - r
     state = jnp.concatenate([moves[:, :z], dot(moves[:, z:], spread)], 1)
     attacks = jnp.where(carried[:, None], spread, 0.0)[r - q :]
@@ -134,29 +139,21 @@ def shortened(Z: Float[Array, "m c"], columns: int) -> tuple[Float[Array, "m q"]
     if columns >= c:
         return jnp.pad(Z, ((0, 0), (0, columns - c))), jnp.asarray(0.0)
     if columns >= m:
-        return jnp.pad(triangle(Z.T).T, ((0, 0), (0, columns - m))), jnp.asarray(0.0)
-    values, vectors = jnp.linalg.eigh(_gram(Z, Z))
+        return jnp.pad(_triangle(Z.T).T, ((0, 0), (0, columns - m))), jnp.asarray(0.0)
+    values, turned = _principal(Z)
     total = jnp.sum(values)
     lost = jnp.sum(jnp.maximum(values[: c - columns], 0.0))
-    return Z @ vectors[:, c - columns :], lost / jnp.where(total > 0, total, 1.0)
+    return turned[:, c - columns :], lost / jnp.where(total > 0, total, 1.0)
+
+
+_triangle = one_at_a_time(triangle)
+
+
+@one_at_a_time
+def _principal(Z):
+    values, vectors = jnp.linalg.eigh(_gram(Z, Z))
+    return values, Z @ vectors
 
 
 def _gram(a, b):
     return dot(a.T, b)
-
-
-def _positive_factor(p):
-    """L with P = L L' for a P that is at least the identity."""
-    return lower_factor(p)[0] if p.shape[0] <= SMALL else jnp.linalg.cholesky(p)
-
-
-def _forward(lower, b):
-    """L^-1 b."""
-    if lower.shape[0] <= SMALL:
-        return solve_lower(lower, jnp.ones(lower.shape[0], bool), b)
-    return solve_triangular(lower, b, lower=True)
-
-
-def _backward(lower, a):
-    """A L^-T."""
-    return _forward(lower, a.T).T

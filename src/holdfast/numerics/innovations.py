@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
-from holdfast.numerics.linalg import SMALL, dot, repeat, sandwich, symmetric
+from holdfast.numerics.linalg import SMALL, dot, one_at_a_time, repeat, sandwich, symmetric
 
 
 class Correction(NamedTuple):
@@ -77,6 +77,7 @@ def _row_by_row(P, C, W, W_inverse, seen) -> Correction:
     return Correction(dot(white, W), jnp.where(seen, moves, 0.0), symmetric(P), log_det + size)
 
 
+@one_at_a_time
 def _factorised(P, C, R, seen) -> Correction:
     R = jnp.where(seen[:, None] & seen[None, :], R, 0.0)
     CP = C @ P

@@ -19,6 +19,14 @@ direction that a sensor sees at all leaves R / (CPC' + R), above 1e-10 unless th
 1e10 times vaguer than the sensor."""
 
 
+def one_at_a_time(function: Callable[..., Any]) -> Callable[..., Any]:
+    """``function`` of every entry of a batch in turn, where `jax.vmap` would batch its LAPACK
+    calls: two batches of them at a time can wait for each other's threads for ever (jaxlib
+    0.10, CPU).
+    """
+    return jax.custom_batching.sequential_vmap(function)
+
+
 def dot(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
     """A @ b for matrices and vectors, as a fusible sum where the matrices are small.
 
@@ -89,6 +97,21 @@ def lower_factor(p: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Arra
     return jnp.array(lower).reshape(n, n), jnp.array(kept, bool)
 
 
+def lower_inverse(lower: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """L^-1 of a well-conditioned L, row by row without LAPACK, so that it may be batched."""
+    n = lower.shape[0]
+    if n <= SMALL:
+        return solve_lower(lower, jnp.ones(n, bool), jnp.eye(n))
+    rows = jnp.arange(n)
+
+    def row(i, inverse):
+        unit = jnp.where(rows == i, 1.0, 0.0)
+        entries = (unit - lower[i] @ inverse) / lower[i, i]
+        return inverse.at[i].set(entries)
+
+    return jax.lax.fori_loop(0, n, row, jnp.zeros_like(lower))
+
+
 def _lower_factor_looped(p):
     n = p.shape[0]
     rows = jnp.arange(n)
@@ -106,10 +129,13 @@ def _lower_factor_looped(p):
 
 def psd_factor(p: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Any F with F F' = P, for positive semidefinite P."""
-    if p.shape[0] > SMALL:
-        values, vectors = jnp.linalg.eigh(p)
-        return vectors * jnp.sqrt(jnp.maximum(values, 0.0))
-    return lower_factor(p)[0]
+    return _eigen_factor(p) if p.shape[0] > SMALL else lower_factor(p)[0]
+
+
+@one_at_a_time
+def _eigen_factor(p):
+    values, vectors = jnp.linalg.eigh(p)
+    return vectors * jnp.sqrt(jnp.maximum(values, 0.0))
 
 
 def solve_lower(
@@ -120,7 +146,7 @@ def solve_lower(
     if n > SMALL:
         safe = jnp.where(kept[:, None], lower, 0.0) + jnp.diag(jnp.where(kept, 0.0, 1.0))
         masked = jnp.where(kept.reshape((n,) + (1,) * (b.ndim - 1)), b, 0.0)
-        return jax.scipy.linalg.solve_triangular(safe, masked, lower=True)
+        return _solve_triangular(safe, masked)
     found: list[Array] = []
     for i in range(n):
         rest = b[i] - sum(lower[i, j] * found[j] for j in range(i))
@@ -128,12 +154,9 @@ def solve_lower(
     return jnp.stack(found) if found else b
 
 
-def solve_upper(lower: Float[Array, "n n"], b: Float[Array, "n *m"]) -> Float[Array, "n *m"]:
-    """X with L' X = b, for a lower L of full rank."""
-    n = lower.shape[0]
-    if n > SMALL:
-        return jax.scipy.linalg.solve_triangular(lower, b, lower=True, trans=1)
-    return dot(solve_lower(lower, jnp.ones(n, bool), jnp.eye(n)).T, b)
+@one_at_a_time
+def _solve_triangular(lower, b):
+    return jax.scipy.linalg.solve_triangular(lower, b, lower=True)
 
 
 def mahalanobis(
@@ -152,7 +175,7 @@ def mahalanobis(
     correlation = scale[:, None] * safe * scale[None, :]
     normalised = scale * v
     if v.shape[0] > SMALL:
-        values, vectors = jnp.linalg.eigh(correlation)
+        values, vectors = one_at_a_time(jnp.linalg.eigh)(correlation)
         kept = values > RANK_TOLERANCE * jnp.maximum(values[-1], 1.0)
         squares = (vectors.T @ normalised) ** 2 / jnp.where(kept, values, 1.0)
         return jnp.sum(jnp.where(kept, squares, 0.0)), jnp.sum(kept)
