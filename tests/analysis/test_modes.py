@@ -373,3 +373,15 @@ def test_the_68_bus_network():
         assert (position.refused, position.confusable) == ((), ())
         # every bus has its angle and its frequency measured: the paper's criterion holds too
         assert position.kept[0].uniform.steps == 1
+
+
+def test_rounding_of_the_decompositions_is_no_coupling():
+    # in exact numbers C_3 = (0, -2, 0) sees the second state alone; the bases leave 1e-16 beside it
+    A = [[1, 2, 0], [0, -2, 0], [-1, 0, 2]]
+    C = [[-1, 0, 0], [0, -2, 0], [2, 0, -1], [0, 0, -1]]
+    G = [[2, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]
+    H = [[0, 2, -1, 0], [0, 0, 0, 0], [1, 0, 0, 0], [0, -1, 1, 0]]
+    m = model(*(np.array(each, float) for each in (A, G, C, H)))
+    pair = nise_pair([m], (0, 1, 2))
+    np.testing.assert_array_equal(np.abs(pair.C) > 0, [[False, True, False]])
+    assert not paper_admissible([m], (0, 1, 2))

@@ -78,14 +78,15 @@ def _stepped(m: Model, before: _Sample, now: _Sample) -> tuple[np.ndarray, np.nd
     rest = now.rest @ m.C
     U, values, Vt = np.linalg.svd(rest @ G, full_matrices=True)
     r = int(np.sum(values > TOLERANCE))
-    G2, C2, C3 = G @ Vt[:r].T, U[:, :r].T @ rest, U[:, r:].T @ rest
+    # an entry of C_2 or C_3 is a unit row times a column of C: its length is what rounding is of
+    length = np.linalg.norm(m.C, axis=0)
+    G2, C2, C3 = G @ Vt[:r].T, _exact(U[:, :r].T @ rest, length), _exact(U[:, r:].T @ rest, length)
     unseen = G @ Vt[r:].T
     G1 = m.G @ before.V1 @ before.M1
     moved = m.A - G1 @ before.C1
     size = np.abs(m.A) + np.abs(G1) @ np.abs(before.C1)
     left = moved - G2 @ (C2 @ moved / values[:r, None])
-    size = size + np.abs(G2) @ (np.abs(C2) @ size / values[:r, None])
-    C3 = _exact(C3, np.abs(U[:, r:].T) @ np.abs(now.rest) @ np.abs(m.C))
+    size = size + np.abs(G2) @ (length @ size / values[:r, None])
     return _exact(left, size), C3, bool(np.linalg.norm(unseen) > TOLERANCE * np.linalg.norm(m.G))
 
 
