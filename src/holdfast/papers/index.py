@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from holdfast.papers import care, decoder, decompose, integrity
+from holdfast.papers import care, decoder, decompose, integrity, nisme
 from holdfast.papers.rows import Study
 
 STUDIES: dict[str, Callable[[], Study]] = {
@@ -10,4 +10,5 @@ STUDIES: dict[str, Callable[[], Study]] = {
     "decompose": decompose.study,
     "decoder": decoder.study,
     "integrity": integrity.study,
+    "nisme": nisme.study,
 }

@@ -8,6 +8,7 @@ import rich.console
 import rich.table
 
 from holdfast.analysis.advice import advice
+from holdfast.analysis.assumptions import on_assumptions
 from holdfast.analysis.fusion import Fusion, Remedy
 from holdfast.analysis.mode_advice import on_modes
 from holdfast.analysis.modes import Reduction, reduce
@@ -15,6 +16,8 @@ from holdfast.analysis.whole import Analysis, analysis
 from holdfast.analysis.wording import between
 from holdfast.analysis.zeros import Zero
 from holdfast.estimators.l1_decoder import L1Decoder
+from holdfast.estimators.nise import Nise
+from holdfast.estimators.nisme import Nisme
 from holdfast.loop import Scenario
 from holdfast.shell import runtime
 from holdfast.shell.attackable_content import (
@@ -60,6 +63,7 @@ def analyse(scenario: str, compromised: str | None, as_json: bool, allow_python:
     weighed = _kind(found) in WEIGHING or len(found.plant.positions) > 1
     if weighed:
         sentences += on_modes(modes)
+    sentences += on_assumptions(found.plant, x0, P0, _assumed(found))
     if as_json:
         shown = content(result, sentences) | {"modes": modes_content(modes)}
         print(json.dumps(shown, allow_nan=False, indent=1))
@@ -77,6 +81,16 @@ def _start(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
 
 def _kind(scenario: Scenario) -> str:
     return type(scenario.monitor.estimator).__module__.rpartition(".")[2]
+
+
+def _assumed(scenario: Scenario) -> list[tuple[int, ...]]:
+    """The sets of channels that the filters of NISE or NISME take as attacked."""
+    estimator, active = scenario.monitor.estimator, []
+    if isinstance(estimator, Nise):
+        active = [estimator.free.active]
+    if isinstance(estimator, Nisme):
+        active = list(np.asarray(estimator.sets.active))
+    return [tuple(np.flatnonzero(mode).tolist()) for mode in active]
 
 
 def _about(scenario: Scenario, asked: bool) -> dict[str, bool]:
