@@ -93,7 +93,8 @@ def test_no_import_cycles():
 def test_matplotlib_only_in_figures():
     users = {m for m in FILES if any(n.split(".")[0] == "matplotlib" for n in imported(m))}
     assert users <= {
-        f"holdfast.report.{name}" for name in ("figures", "paper_figures", "roc_figure")
+        f"holdfast.report.{name}"
+        for name in ("figures", "mode_figures", "paper_figures", "roc_figure")
     }
 
 

@@ -6,10 +6,11 @@ import numpy as np
 
 from holdfast.campaign.attack_free import attack_free
 from holdfast.detectors import chi_square, cusum, per_channel, sprt, windowed
-from holdfast.estimators import kalman, unknown_input
+from holdfast.estimators import kalman, nisme, unknown_input
 from holdfast.loop import Monitor
 from holdfast.plants.build import linear_plant
 
+ESTIMATORS = {"kalman": kalman, "unknown_input": unknown_input, "nisme": nisme}
 DETECTORS = {
     "chi_square": (chi_square, {}),
     "windowed": (windowed, {}),
@@ -39,7 +40,7 @@ def plant(growth=1.0):
 def monitor(name, on, estimator, growth=1.0, **settings):
     module, own = DETECTORS[name]
     p = plant(growth)
-    build = kalman.build if estimator == "kalman" else unknown_input.build
+    build = ESTIMATORS[estimator].build
     return Monitor(build(p, jnp.zeros(2), jnp.eye(2)), module.build(p, on=on, **own, **settings))
 
 

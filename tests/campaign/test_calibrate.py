@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from holdfast.campaign.attack_free import horizon
+from holdfast.campaign.attack_free import attack_free, horizon
 from holdfast.campaign.calibrate import calibrated, content_key, from_log
 from holdfast.loop import Scenario, replay, simulate
 from holdfast.parts import InvalidValue
@@ -65,6 +65,23 @@ def test_correlated_attack_estimates_need_more_than_the_quantile():
     # the same content: the same record, not simulated again
     again = calibrated(monitor("windowed", "attack", "unknown_input"), runs=500)[1]
     assert again is sums
+
+
+@pytest.mark.slow
+def test_a_bank_that_believes_in_no_attack_has_passed_its_test():
+    """Its false-alarm rate is per row, not per row in which it believes in an attack."""
+    watched = monitor("chi_square", "attack", "nisme", level=LEVEL)
+    calm, how = calibrated(watched, runs=50)
+    assert how.method == "simulated"
+    assert "at most 0.01" in how.sentence
+    judged = attack_free(calm, None, jax.random.split(jax.random.key(7), 50), 500)
+    assert 0 < np.mean(np.isfinite(judged.threshold)) < 0.5
+    assert np.mean(judged.alarm) <= LEVEL
+    assert float(calm.detector.factor) >= 1.0
+    quiet = Observation.of(np.zeros((300, 1)), 0.1 * np.random.default_rng(0).normal(size=(300, 4)))
+    logged, how = from_log(watched, quiet)
+    assert float(logged.detector.factor) >= 1.0
+    assert how.steps == 300
 
 
 def test_a_key_depends_on_content_alone():

@@ -7,7 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from holdfast.numerics.linalg import SMALL, dot, lower_factor, mahalanobis, psd_factor, solve_lower
+from holdfast.numerics.linalg import (
+    SMALL,
+    dot,
+    lower_factor,
+    lower_inverse,
+    mahalanobis,
+    psd_factor,
+    solve_lower,
+)
 
 jitted_distance = jax.jit(mahalanobis)
 
@@ -76,3 +84,25 @@ def test_mahalanobis_leaves_out_what_has_no_variance_or_an_infinite_one(n):
     found, dof = mahalanobis(jnp.asarray(v), jnp.asarray(cov))
     assert dof == n - 2
     np.testing.assert_allclose(found, 4.0 * (n - 2))
+
+
+def test_batches_of_large_matrices_go_one_at_a_time_and_give_the_same():
+    # more than SMALL rows: LAPACK, which must not be batched (two batches can lock one another)
+    n = SMALL + 3
+    roots = jax.random.normal(jax.random.key(0), (4, n, n))
+    cov = roots @ jnp.swapaxes(roots, 1, 2)
+    v = roots[:, 0]
+    factor = jax.jit(jax.vmap(psd_factor))(cov)
+    np.testing.assert_allclose(factor @ jnp.swapaxes(factor, 1, 2), cov, rtol=0, atol=1e-12)
+    statistic, dof = jax.jit(jax.vmap(mahalanobis))(v, cov)
+    expected = [x @ np.linalg.solve(P, x) for x, P in zip(*map(np.asarray, (v, cov)), strict=True)]
+    np.testing.assert_allclose(statistic, expected, rtol=1e-8)
+    assert dof.tolist() == [n] * 4
+    lower, kept = jax.vmap(lower_factor)(cov)
+    solved = jax.jit(jax.vmap(solve_lower))(lower, kept, roots)
+    np.testing.assert_allclose(lower @ solved, roots, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(
+        jax.vmap(lower_inverse)(lower) @ lower, np.broadcast_to(np.eye(n), (4, n, n)), atol=1e-9
+    )
+    program = jax.jit(jax.vmap(mahalanobis)).lower(v, cov).as_text()
+    assert "while" in program

@@ -29,6 +29,7 @@ from holdfast.detectors.windowed import Windowed
 from holdfast.estimators.care import Care
 from holdfast.estimators.decomposition import Decomposition
 from holdfast.estimators.kalman import Kalman
+from holdfast.estimators.nisme import Nisme
 from holdfast.estimators.unknown_input import UnknownInput
 from holdfast.loop import Monitor, replay
 from holdfast.parts import Controller, Detector, Estimator, InvalidValue
@@ -185,7 +186,7 @@ def _simulated(
         value, rates = _crossing(rates_at, level, detector)
     else:
         judged = attack_free(monitor, controller, keys, steps)
-        ratio = _ratio(judged)[:, burn_in:]
+        ratio = _passed(monitor, _ratio(judged)[:, burn_in:])
         tested = np.sort(ratio[np.isfinite(ratio)])[::-1]
         if len(tested) * level < LEAST_ALARMS:
             raise InvalidValue(
@@ -193,17 +194,34 @@ def _simulated(
                 f"{len(tested)} rows of the simulation with anything to test",
                 f"{LEAST_ALARMS / level:.0f} or more: is what is tested ever determined?",
             )
-        value = _above(tested[int(level * len(tested))])
+        value = _highest(monitor, tested[int(level * len(tested))])
         alarms = np.sum(ratio > value, 1)
         rates = alarms / np.maximum(np.sum(np.isfinite(ratio), 1), 1)
     error = float(np.std(rates, ddof=1) / np.sqrt(runs))
     how = f"raised by {value:.4g}" if isinstance(detector, Sprt) else f"scaled by {value:.4g}"
+    rate = f"{np.mean(rates):.2g}, at most {level:g}," if _believes(monitor) else f"{level:g}"
     sentence = (
-        f"False-alarm rate {level:g} +- {error:.2g} (standard error) per step over {runs} "
+        f"False-alarm rate {rate} +- {error:.2g} (standard error) per step over {runs} "
         f"attack-free runs of {steps} rows, the first {burn_in} left out (seed {seed}); "
         f"threshold {how}."
     )
     return Calibration("simulated", level, value, sentence, error, None, seed, runs, steps, burn_in)
+
+
+def _believes(monitor: Monitor) -> bool:
+    """Whether what is tested is an attack that a bank of modes believes in, if it does at all."""
+    detector = monitor.detector
+    return isinstance(monitor.estimator, Nisme) and getattr(detector, "on", None) == "attack"
+
+
+def _passed(monitor: Monitor, ratio: np.ndarray) -> np.ndarray:
+    """The ratio, 0 where a bank believes in no attack: a row that has passed its test."""
+    return np.where(np.isnan(ratio), 0.0, ratio) if _believes(monitor) else ratio
+
+
+def _highest(monitor: Monitor, value: float) -> float:
+    """The factor with ``value`` just not above it; of a bank never under the quantile's own."""
+    return max(1.0, _above(value)) if _believes(monitor) else _above(value)
 
 
 def _above(value: float) -> float:
@@ -293,7 +311,7 @@ def from_log(monitor: Monitor, observations: Observation) -> tuple[Monitor, Cali
     level = float(detector.level)
     neutral = with_value(monitor, 0.0 if isinstance(detector, Sprt) else 1.0)
     verdict = replay(neutral, observations).verdict
-    ratio = _ratio(verdict)
+    ratio = _passed(monitor, _ratio(verdict))
     tested = np.isfinite(ratio)
     ratio = ratio[tested]
     n = len(ratio)
@@ -308,7 +326,8 @@ def from_log(monitor: Monitor, observations: Observation) -> tuple[Monitor, Cali
 
         value, _ = _crossing(rates, alarms / n, detector)
     else:
-        value = _above(np.sort(ratio)[::-1][alarms])
+        value = _highest(monitor, np.sort(ratio)[::-1][alarms])
+        alarms = int(np.sum(ratio > value))
     free = n / _correlation_rows(ratio)
     upper = float(betaincinv(alarms * free / n + 1.0, free * (1.0 - alarms / n), 0.95))
     seen = f"{n} attack-free rows (worth {free:.0f} independent ones)"

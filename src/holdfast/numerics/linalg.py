@@ -129,13 +129,15 @@ def _lower_factor_looped(p):
 
 def psd_factor(p: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Any F with F F' = P, for positive semidefinite P."""
-    return _eigen_factor(p) if p.shape[0] > SMALL else lower_factor(p)[0]
+    if p.shape[0] > SMALL:
+        values, vectors = _eigen(p)
+        return vectors * jnp.sqrt(jnp.maximum(values, 0.0))
+    return lower_factor(p)[0]
 
 
 @one_at_a_time
-def _eigen_factor(p):
-    values, vectors = jnp.linalg.eigh(p)
-    return vectors * jnp.sqrt(jnp.maximum(values, 0.0))
+def _eigen(p):
+    return tuple(jnp.linalg.eigh(p))
 
 
 def solve_lower(
@@ -175,7 +177,7 @@ def mahalanobis(
     correlation = scale[:, None] * safe * scale[None, :]
     normalised = scale * v
     if v.shape[0] > SMALL:
-        values, vectors = one_at_a_time(jnp.linalg.eigh)(correlation)
+        values, vectors = _eigen(correlation)
         kept = values > RANK_TOLERANCE * jnp.maximum(values[-1], 1.0)
         squares = (vectors.T @ normalised) ** 2 / jnp.where(kept, values, 1.0)
         return jnp.sum(jnp.where(kept, squares, 0.0)), jnp.sum(kept)

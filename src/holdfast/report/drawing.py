@@ -9,6 +9,9 @@ INK, SOFT, GRID, PAPER = "#1c2733", "#5a6774", "#dce2e8", "#fefefe"
 MAIN, ALARM, ATTACK, LOST, FAULT = "#0072b2", "#d55e00", "#e69f00", "#8894a0", "#cc79a7"
 """Okabe and Ito's palette, which the colour-blind tell apart."""
 
+MORE = "#009e73", "#56b4e9"
+"""Of the same palette, for more than a few kinds: readable on light and dark as they are."""
+
 VARIABLES = {
     INK: "ink", SOFT: "soft", GRID: "grid", PAPER: "paper", MAIN: "main", ALARM: "alarm",
     ATTACK: "attack", LOST: "lost", FAULT: "fault",
@@ -53,6 +56,15 @@ def shares(mask: np.ndarray, bins: int) -> np.ndarray:
     folded = _folded(mask.astype(float), bins)
     count = (~np.isnan(folded)).sum(1)
     return np.nansum(folded, 1) / count
+
+
+def averaged(values: np.ndarray, bins: int) -> tuple[np.ndarray, np.ndarray]:
+    """The mean of each column of values over at most so many parts of the rows, and which row
+    each part begins with.
+    """
+    starts = np.arange(0, len(values), -(-len(values) // bins))
+    sizes = np.diff(np.append(starts, len(values)))
+    return np.add.reduceat(values.astype(float), starts) / sizes[:, None], starts
 
 
 def _folded(values: np.ndarray, bins: int) -> np.ndarray:

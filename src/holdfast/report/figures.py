@@ -350,9 +350,14 @@ def _one_panel(layout: Layout, height: float, *, time: bool = True) -> tuple[Fig
     return figure, panel
 
 
-def _legend(figure: Figure, keys: list, layout: Layout) -> None:
-    figure.legend(handles=keys, loc="outside upper left", ncols=5 if layout.columns > 1 else 2,
+def legend(figure: Figure, keys: list, columns: int) -> None:
+    """What the colours mean, above the panels."""
+    figure.legend(handles=keys, loc="outside upper left", ncols=columns,
                   handlelength=1.6, columnspacing=1.4, borderaxespad=0.2)  # fmt: skip
+
+
+def _legend(figure: Figure, keys: list, layout: Layout) -> None:
+    legend(figure, keys, 5 if layout.columns > 1 else 2)
 
 
 def _shade(panel: Axes, t: np.ndarray, window: Window) -> None:

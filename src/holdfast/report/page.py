@@ -20,7 +20,7 @@ from holdfast.report import sections
 from holdfast.report.markup import Markup, element, items, join, section, settings
 from holdfast.report.pictures import Picture, draw
 from holdfast.report.tables import dataset, json_safe
-from holdfast.report.truth import Named
+from holdfast.report.truth import Modes, Named
 from holdfast.report.words import count, seconds
 
 FILES = ("report.html", "result.nc", "scores.json", "scenario.toml")
@@ -40,6 +40,7 @@ def write_report(
     attack_window: tuple[float, float] | None = None,
     units: Mapping[str, str] | None = None,
     notes: Sequence[str] = (),
+    modes: Modes | None = None,
 ) -> Path:
     """Write report.html, result.nc, scores.json, scenario.toml and figures/*.svg.
 
@@ -47,14 +48,15 @@ def write_report(
     first. ``summary``: what `holdfast.report.tables.summary` gave. ``calibration``: how the
     threshold was found, name to value. ``blindness``: what the detector cannot see, as
     sentences or as rows (name to value) of a table. ``attack_window`` in seconds is shaded;
-    without it that of the summary. ``units``: name of a state, output, ... -> unit.
+    without it that of the summary. ``units``: name of a state, output, ... -> unit. ``modes``:
+    what those are that the estimator weighs.
 
     Each file appears whole or not at all. Returns the path of the page. OSError where the
     directory cannot be written.
     """
     directory = Path(directory)
     units = units or {}
-    whole = dataset(trace, plant, time, units=units)
+    whole = dataset(trace, plant, time, units=units, modes=modes)
     data = whole.isel(run=0) if "run" in whole.dims else whole
     summary = json_safe(summary)
     window = attack_window or _window(summary)
@@ -97,6 +99,8 @@ def render(
 
     parts = [
         section("alarms", "Alarms", *shown("statistic"), sections.episodes(summary, units)),
+        section("modes", "Modes", *shown("modes"), sections.mode_scores(summary))
+        if "modes" in pictures else None,
         section("attack", "Attack estimate", *shown("attacks"), sections.attack_scores(summary))
         if "attacks" in pictures else None,
         section("state", "State", *shown("path", "states"), sections.state_scores(summary)),

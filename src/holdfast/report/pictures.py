@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 
 from holdfast.evaluate import scores
-from holdfast.report import figures
+from holdfast.report import figures, mode_figures
 from holdfast.report.drawing import inline, map_pair
 from holdfast.report.figures import NARROW, PANELS, WIDE, Layout, Window
 from holdfast.report.markup import Markup, element
@@ -46,6 +46,14 @@ def draw(data: xr.Dataset, summary: Mapping[str, Any], window: Window) -> dict[s
             "An alarm is raised where the statistic exceeds the threshold (dashed); alarms are "
             f"dots, and marks along the top edge.{shaded}",
             lambda layout: figures.statistic(data, window, layout))  # fmt: skip
+    if "mode" in data and "p" in data:
+        known = "true_mode" in data
+        strips = "The strips show the mode believed in and the true one" if known else (
+            "The strip shows the mode believed in")  # fmt: skip
+        gap = "; a gap where none of the modes was true" if known else ""
+        add("modes", "Probability of each mode over time, and the mode believed in",
+            f"{strips}{gap}. Below, how probable the bank holds each mode; together they are 1.",
+            lambda layout: mode_figures.modes(data, layout))  # fmt: skip
     if "d" in data and data.sizes["attack"]:
         add("attacks", "Attack estimate of each channel over time with its 2-sigma band",
             "What each attack channel is estimated to inject. Nothing is injected as long as "

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from holdfast import __version__
 from holdfast.records import Reason, Status, Trace
-from holdfast.report.truth import Named, true_attack
+from holdfast.report.truth import Modes, Named, true_attack, true_mode
 
 GONE, MISSING, FAULTY = 3, 1, 2
 """What became of a sample: it did not arrive, it was NaN or infinite, or one of the two."""
@@ -30,7 +30,12 @@ def channel_names(trace: Trace, plant: Named) -> tuple[str, ...]:
 
 
 def dataset(
-    trace: Trace, plant: Named, time: ArrayLike, *, units: Mapping[str, str] | None = None
+    trace: Trace,
+    plant: Named,
+    time: ArrayLike,
+    *,
+    units: Mapping[str, str] | None = None,
+    modes: Modes | None = None,
 ) -> xr.Dataset:
     """Everything a run gave, with named dimensions; a leading axis of the trace is ``run``.
 
@@ -38,6 +43,11 @@ def dataset(
     axis is the name with ``_``. What the data do not determine is NaN with an infinite
     covariance; what was not tested has a NaN ``statistic``. ``units``: name of a state,
     input, output or attack -> unit. ``true_*`` and ``injected_*`` only if simulated.
+
+    Of an estimator that weighs modes: ``p`` over ``bank``, the modes that have a filter;
+    ``mode`` and ``true_mode``, numbers of entries of ``named``, the modes told apart, the true
+    one -1 where it is none of them and only if ``modes`` says what they are.
+    ``injected_switch`` is a number of an entry of ``position``.
 
     It goes to NetCDF with ``to_netcdf(path, engine="h5netcdf")`` and comes back the same.
     """
@@ -94,11 +104,21 @@ def dataset(
         put("injected_u", ("input",), trace.injection.u, "injected into the actuators at the row")
         put("injected_y", ("output",), trace.injection.y, "injected into the sensors at the row")
         put("injected_d", ("attack",), trace.injection.d, "injected into the channels at the row")
+        if trace.injection.switch is not None:
+            put("injected_switch", (), trace.injection.switch,
+                "where the switches stand after the row: a number of position")  # fmt: skip
     truth = true_attack(trace, plant)
     if truth is not None:
         put("true_d", ("attack",), truth,
             "whole injection in terms of the attack channels, at the time that d of the row "
             "refers to; NaN where no combination of channels equals it")  # fmt: skip
+    if estimate.p is not None:
+        put("p", ("bank",), estimate.p, "probability of each mode of the bank")
+    if estimate.mode is not None:
+        put("mode", (), estimate.mode, "the mode believed in: a number of named")
+        real = None if modes is None else true_mode(trace, truth, modes)
+        if real is not None:
+            put("true_mode", (), real, "the true mode: a number of named, -1 for none of them")
     return xr.Dataset(
         variables, _coordinates(trace, plant, time, lead, units or {}), _attributes(plant)
     )
@@ -124,6 +144,10 @@ def _coordinates(
         kinds["attack"] = plant.attacks
     if trace.verdict.channel_alarms.shape[-1]:
         kinds["channel"] = channel_names(trace, plant)
+    if trace.injection is not None and trace.injection.switch is not None:
+        kinds["position"] = plant.positions
+    kinds |= {"bank": trace.modes} if trace.estimate.p is not None else {}
+    kinds |= {"named": trace.named} if trace.estimate.mode is not None else {}
     for kind, names in kinds.items():
         # a fixed-width array of no names cannot be written
         labels = np.array(names, dtype=object if not names else None)

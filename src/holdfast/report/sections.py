@@ -18,7 +18,7 @@ from holdfast.report.markup import (
 from holdfast.report.words import DASH, number, percent, seconds
 
 SHOWN = 20
-"""Episodes listed on the page; scores.json has all."""
+"""Episodes and modes listed on the page; scores.json has all."""
 
 _TAGS = {"attack": "Attack detected", "missed": "Attack missed", "alarm": "Alarm",
          "quiet": "No alarm"}  # fmt: skip
@@ -58,6 +58,10 @@ def key_numbers(summary: Mapping[str, Any]) -> Markup:
     if false is None and detection is None:
         tiles.append(("Alarm episodes", str(len(run["episodes"])),
                       f"{percent(summary['alarm_rows']['value'])} of the rows"))  # fmt: skip
+    modes = summary["modes"]
+    if modes is not None and modes["accuracy"] is not None:
+        tiles.append(("Mode right", percent(modes["accuracy"]["value"]),
+                      f"of {modes['accuracy']['of']} rows"))  # fmt: skip
     tested = summary["tested"]
     tiles.append(("Rows tested", percent(tested["value"]), f"of {tested['of']} rows"))
     cells = (
@@ -106,6 +110,31 @@ def _is_false(episode: Mapping[str, Any], summary: Mapping[str, Any]) -> bool:
     if summary["attack"] is None:
         return summary["simulated"]
     return episode["begin_s"] < summary["attack"]["start_s"]
+
+
+def mode_scores(summary: Mapping[str, Any]) -> Markup:
+    """How often each mode was believed in and, if the truth is known, how rightly and how soon."""
+    found, dt = summary["modes"], summary["dt_s"]
+    said = words.modes(summary)
+    parts = [element("p", said)] if said else []
+    if found["true"]:
+        columns = [Column("True mode"), Column("Rows", True), Column("Believed in", True),
+                   Column("Times", True), Column("Median delay", True),
+                   Column("Largest delay", True)]  # fmt: skip
+        rows = [
+            [name, str(row["accuracy"]["of"]), percent(row["accuracy"]["value"]),
+             str(row["spells"]), seconds(row["median_delay_s"], dt),
+             seconds(row["largest_delay_s"], dt)]
+            for name, row in found["true"].items()
+        ]  # fmt: skip
+        caption = "Delays are until the mode was first believed in, each time it was true."
+        parts.append(table(columns, rows, caption))
+    columns = [Column("Mode believed in"), Column("Rows", True), Column("Share", True)]
+    ordered = sorted(found["believed"].items(), key=lambda item: -item[1]["hits"])
+    rows = [[name, str(row["hits"]), percent(row["value"])] for name, row in ordered[:SHOWN]]
+    more = len(ordered) - SHOWN
+    caption = f"The first {SHOWN} of {len(ordered)}; all are in scores.json." if more > 0 else ""
+    return join([*parts, table(columns, rows, caption)])
 
 
 def state_scores(summary: Mapping[str, Any]) -> Markup:

@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike
 from holdfast import __version__
 from holdfast.evaluate import scores
 from holdfast.records import Reason, Status, Trace
+from holdfast.report.mode_scores import mode_scores, mode_spells
 from holdfast.report.results import FAULTY, GONE, MISSING, channel_names, dataset
-from holdfast.report.truth import Named
+from holdfast.report.truth import Modes, Named
 
 __all__ = ["Named", "channel_names", "dataset", "json_safe", "summary"]
 
@@ -27,6 +28,7 @@ def summary(
     attack_window: tuple[float, float] | None = None,
     *,
     gap: float | None = None,
+    modes: Modes | None = None,
 ) -> dict[str, Any]:
     """The scores of a run, or of a batch of runs pooled, fit for JSON (null for NaN and inf).
 
@@ -34,8 +36,9 @@ def summary(
     injection, if simulated. False alarms are judged where it is known that nobody attacks:
     before the attack, or everywhere in a simulation without one. Alarms at most ``gap``
     seconds apart (default ten rows) are one episode. Intervals have 95 % confidence.
+    ``modes``: what those are that the estimator weighs, so that the true one is known.
     """
-    data = dataset(trace, plant, time)
+    data = dataset(trace, plant, time, modes=modes)
     if "run" not in data.dims:
         data = data.expand_dims("run")
     gap = EPISODE_GAP * float(plant.dt) if gap is None else gap
@@ -65,6 +68,7 @@ def summary(
         "consistency": _consistency(data, benign, known=bool(window) or simulated),
         "data": _quality(data),
         "status": _status(data),
+        "modes": mode_scores(data),
         "per_run": runs,
     }
     return json_safe(found)
@@ -102,6 +106,8 @@ def _injected_window(data: xr.Dataset) -> tuple[float, float] | None:
     touched = np.zeros(data.sizes["time"], bool)
     for name in names:
         touched |= np.any(data[name].values != 0, axis=(0, 2))
+    if "injected_switch" in data:
+        touched |= np.any(data["injected_switch"].values != 0, axis=0)
     rows = np.flatnonzero(touched)
     if rows.size == 0:
         return None
@@ -118,6 +124,8 @@ def _one_run(data: xr.Dataset, window: tuple[float, float] | None, gap: float) -
     t, alarm = data.time.values, data.alarm.values
     spans = scores.episodes(t, alarm, gap)
     found: dict[str, Any] = {"episodes": [_episode(data, *span) for span in spans]}
+    if "mode" in data:
+        found["modes"] = mode_spells(data)
     if window is None:
         return found
     delay = scores.detection_delay(t, alarm, *window)

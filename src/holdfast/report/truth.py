@@ -39,11 +39,56 @@ class Named(Protocol):
         """One name per attack channel."""
         ...
 
+    @property
+    def positions(self) -> tuple[str, ...]:
+        """One name per position of the switches."""
+        ...
+
     def transition(self, k, x, u, d) -> Any:
         """The state at k without noise."""
 
     def output(self, k, x, u, d) -> Any:
         """The measurement at k without noise."""
+
+
+@runtime_checkable
+class Modes(Protocol):
+    """What the modes of ``Trace.named`` are: where the switches stand, by number, and which of
+    the attack channels are attacked (modes x attacks).
+    """
+
+    @property
+    def position(self) -> Any:
+        """One number per mode."""
+        ...
+
+    @property
+    def active(self) -> Any:
+        """One row per mode."""
+        ...
+
+
+def true_mode(trace: Trace, truth: np.ndarray | None, modes: Modes) -> np.ndarray | None:
+    """The number of the mode that was true, row by row; -1 for none of them.
+
+    Attacked are the channels whose `true_attack` is not 0. Where an injection equals no values
+    of the channels, or a switch was thrown at the row or just before it, no mode is true.
+    None unless simulated.
+    """
+    if trace.injection is None:
+        return None
+    injection = jax.tree.map(np.asarray, trace.injection)
+    if truth is None:  # no channel to say it with
+        elsewhere = np.any(injection.y != 0, -1) | np.any(injection.u != 0, -1)
+        attacked = np.zeros((*elsewhere.shape, 0), bool)
+    else:
+        elsewhere, attacked = np.any(np.isnan(truth), -1), truth != 0
+    position = np.zeros(elsewhere.shape, int) if injection.switch is None else injection.switch
+    before = np.concatenate([position[..., :1], position[..., :-1]], -1)
+    fits = np.all(attacked[..., None, :] == np.asarray(modes.active), -1)
+    fits &= position[..., None] == np.asarray(modes.position)
+    fits &= ~(elsewhere | (position != before))[..., None]
+    return np.where(np.any(fits, -1), np.argmax(fits, -1), -1).astype(np.int32)
 
 
 def true_attack(trace: Trace, plant: Named) -> np.ndarray | None:
@@ -72,7 +117,8 @@ def true_attack(trace: Trace, plant: Named) -> np.ndarray | None:
 
 @eqx.filter_jit
 def _rows_as_channels(plant: Named, *rows):
-    return jax.vmap(lambda *row: _as_channels(plant, *row))(*rows)
+    # row by row: batches of LAPACK calls can lock one another out
+    return jax.lax.map(lambda row: _as_channels(plant, *row), rows)
 
 
 def _as_channels(plant: Named, k, x, u, extra_u, extra_y, d):

@@ -20,6 +20,8 @@ class Verdict(NamedTuple):
 def verdict(scores: Mapping[str, Any], units: Mapping[str, str]) -> Verdict:
     """The verdict at the top of a report, from `holdfast.report.tables.summary`."""
     more = [] if scores["tested"]["value"] else ["Nothing could be tested at any row."]
+    right = modes(scores)
+    more += [right] if right else []
     if scores["runs"] > 1:
         return _over_runs(scores, more)
     run, dt = scores["per_run"][0], scores["dt_s"]
@@ -83,6 +85,17 @@ def _without_attack(scores, episodes, units, more) -> Verdict:
     if len(episodes) > 1:
         more.append(f"{len(episodes)} alarm episodes in {length}.")
     return Verdict("alarm", sentence + ".", tuple(more))
+
+
+def modes(scores: Mapping[str, Any]) -> str | None:
+    """How often the mode believed in was the true one; None where that is not known."""
+    found = scores["modes"]
+    if found is None or found["accuracy"] is None or not found["accuracy"]["of"]:
+        return None
+    right, rows = found["accuracy"], count(found["accuracy"]["of"], "row")
+    said = f"The mode believed in was the true one in {percent(right['value'])} of {rows}"
+    unlisted = found["unlisted"]["hits"]
+    return f"{said}; in {unlisted} more no mode told apart was true." if unlisted else f"{said}."
 
 
 def reason(episode: Mapping[str, Any]) -> str:

@@ -20,6 +20,7 @@ from holdfast.parts import InvalidValue
 from holdfast.plants.linear import LinearPlant
 from holdfast.records import Trace
 from holdfast.shell import runtime
+from holdfast.shell.banks import hypotheses_of
 from holdfast.shell.calibrating import busy, calibrated_scenario, dear
 from holdfast.shell.errors import InputError
 from holdfast.shell.logs import read_log
@@ -81,7 +82,8 @@ def run(
         return
     from holdfast.report.tables import summary
 
-    _print_scores(summary(trace, ready.plant, time))
+    modes = hypotheses_of(ready.monitor.estimator)
+    _print_scores(summary(trace, ready.plant, time, modes=modes))
     print(how.sentence)
 
 
@@ -122,7 +124,7 @@ def _report(
     from holdfast.report.page import write_report
     from holdfast.report.tables import summary
 
-    plant = scenario.plant
+    plant, modes = scenario.plant, hypotheses_of(scenario.monitor.estimator)
     sentences, notes = _blind_spots(scenario)
     with busy("writing the report"):
         try:
@@ -133,10 +135,11 @@ def _report(
                 time=time,
                 title=title,
                 scenario_text=source,
-                summary=summary(trace, plant, time),
+                summary=summary(trace, plant, time, modes=modes),
                 calibration=_told(how),
                 blindness=sentences,
                 notes=notes,
+                modes=modes,
             )
         except OSError as error:
             raise unwritable(folder, error) from None

@@ -1,6 +1,6 @@
 """Results: one row per step, as CSV (exact floats) or NetCDF (with full covariances)."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +73,10 @@ def _columns(trace: Trace, plant: Plant, time: np.ndarray) -> dict[str, Column]:
         names = channel_names(trace, plant)
         _add(columns, "alarm", names, flags.astype(int), np.zeros(flags.shape, bool))
     columns["reason"] = (_reasons(verdict.reason, flags, names), never)
+    if estimate.mode is not None:
+        columns["mode"] = (_words(estimate.mode, lambda i: _quoted(trace.named[i])), never)
+    if estimate.p is not None:
+        _add(columns, "p", trace.modes, estimate.p, np.zeros(estimate.p.shape, bool))
     columns["status"] = (_words(estimate.status, lambda code: Status(code).words), never)
     return columns
 
@@ -96,7 +100,7 @@ def _reasons(codes: np.ndarray, flags: np.ndarray, names: Sequence[str]) -> np.n
     return words
 
 
-def _words(codes: np.ndarray, of) -> np.ndarray:
+def _words(codes: np.ndarray, of: Callable[[int], str]) -> np.ndarray:
     kinds, which = np.unique(codes, return_inverse=True)
     return np.array([of(int(kind)) for kind in kinds], object)[which]
 

@@ -19,6 +19,7 @@ from holdfast.catalog import ATTACKS, CONTROLLERS, DETECTORS, ESTIMATORS, PLANTS
 from holdfast.loop import Monitor, Scenario
 from holdfast.parts import Detector, Estimator, InvalidValue, Plant
 from holdfast.plants.build import covariance
+from holdfast.shell.banks import reduce_bank
 from holdfast.shell.enforcing import enforcement_of
 from holdfast.shell.errors import InputError, shown
 from holdfast.shell.reading import SCENARIO_LIMIT, STANDARD_INPUT, decode, read_bytes
@@ -191,14 +192,16 @@ def _part(
 
 def _estimator(table: Table, plant: Plant) -> Estimator:
     n = len(plant.states)
-    for key, shape in (("x0", (n,)), ("P0", (n, n))):
-        if key in table.values:
-            table.values[key] = table.array(key, table.values[key], shape)
+    if "x0" in table.values:
+        table.values["x0"] = table.array("x0", table.values["x0"], (n,))
     if "P0" in table.values:
+        given = table.array("P0", table.values["P0"], (n, n), (n,))
         try:
-            table.values["P0"] = covariance("P0", table.values["P0"])
+            table.values["P0"] = covariance("P0", np.diag(given) if given.ndim == 1 else given)
         except InvalidValue as error:
             raise table.error(error.key, str(error.found), error.expected) from None
+    if table.values.get("kind") == "nisme":
+        reduce_bank(table, plant)
     return _part(table, ESTIMATORS, plant, skip=("x0", "P0"))
 
 

@@ -16,8 +16,8 @@ from holdfast.parts import InvalidValue
 from holdfast.shell.errors import InputError, did_you_mean, one_of, shown
 from holdfast.shell.matrices import matrix
 
-ARRAYS = ("x0", "P0")
-"""Parameters that are arrays whatever they are annotated with."""
+ARRAYS = {"x0": "a list of numbers", "P0": "rows of numbers, or the numbers of the diagonal"}
+"""Parameters that are arrays whatever they are annotated with, in words."""
 FROM_SCENARIO = ("enforcement",)
 """Keyword parameters of a part that the scenario as a whole gives, not the part's own table."""
 
@@ -78,13 +78,13 @@ class Table:
             raise self.error("kind", shown(found), one_of(known, str(found)))
         return found
 
-    def array(self, key: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
-        """The value as an array of this shape, finite."""
+    def array(self, key: str, value: Any, *shapes: tuple[int, ...]) -> np.ndarray:
+        """The value as an array of one of these shapes, finite."""
         found = matrix(value, self.file, f"{self.key}.{key}", self.folder)
         if not isinstance(found, np.ndarray):
             raise self.error(key, "a table on a grid", "numbers")
-        if found.shape != shape:
-            raise self.error(key, _size(found.shape), _size(shape))
+        if found.shape not in shapes:
+            raise self.error(key, _size(found.shape), " or ".join(map(_size, shapes)))
         if not np.all(np.isfinite(found)):
             raise self.error(key, "NaN or infinity", "finite numbers")
         return found
@@ -191,8 +191,7 @@ def model_of(build: Callable[..., Any], given: int) -> type[BaseModel]:
         needed = parameter.default is inspect.Parameter.empty
         default = PydanticUndefined if needed else parameter.default
         if parameter.name in ARRAYS:
-            words = "a list of numbers" if parameter.name == "x0" else "rows of numbers"
-            fields[parameter.name] = (Any, Field(default, description=words))
+            fields[parameter.name] = (Any, Field(default, description=ARRAYS[parameter.name]))
         else:
             fields[parameter.name] = (annotation, Field(default))
     config = ConfigDict(
@@ -233,7 +232,7 @@ def in_words(annotation: Any, found: str = "") -> str:
     if origin in (typing.Union, types.UnionType):
         return " or ".join(word for word in map(in_words, inside) if word)
     if _is_list(annotation):
-        return f"a list of {_plural(inside[0])}" if inside else "a list"
+        return f"a list of {_plural(inside[0])}" if inside and inside[0] is not Any else "a list"
     if annotation is Any:
         return "a matrix: rows of numbers, or { file = .., name = .. }"
     return _WORDS.get(annotation, "")

@@ -22,8 +22,11 @@ KINDS = {
 }
 """What a template has unless it is asked for something else."""
 
-NEEDS = {"switch": "swing", "linearising": "swing"}
-"""The plant of those that do not work with a linear one."""
+NEEDS = {
+    "switch": {"plant": "swing", "estimator": "nisme"},
+    "linearising": {"plant": "swing"},
+}
+"""What goes with those that do not work with what a template has."""
 
 REQUIRED = {
     "epsilon": 0.001,
@@ -83,10 +86,31 @@ EXAMPLES: dict[str, dict[str, Any]] = {
             "attacks": ["actuator:1", "sensor:P_elec:2"],
             "switches": [["1-2"]],
         },
+        "x0": [0.3, -0.4, 0.1, 0.0, 0.0, 0.0],
     },
     "unicycle": {"plant": {"landmarks": [[4.0, 1.0], [1.0, 5.0], [-3.0, 2.0], [2.0, -4.0]]}},
 }
-"""What suits a plant better than zeros: where it starts, and what to attack."""
+"""What suits a plant better than zeros: where it starts (power flows only between different
+angles), and what to attack."""
+
+NOTES = {
+    "x0": "estimate one sample before the first row",
+    "P0": "and its covariance; a list of numbers is its diagonal",
+    "mode": "the attack channels that are attacked",
+    "modes": 'also: "all", or a list of modes: [] for none, ["NAME", ..], '
+    '{ name = .., attacks = [..], switch = ".." }',
+    "floor": "no mode's probability falls below it",
+    "likelihood": "also: paper, quadratic (to compare with)",
+    "attack_prior_sd": "how large an attack may well be; one number, or one per attack",
+    "transition": "a number: chance per row that the mode changes; or rows of them",
+    "bank": 'the modes that have a filter: a list, or "reduced" (with window = ROWS)',
+    "level": "false-alarm budget of naming channels, with a bank",
+    "freeze": "hold gains that change by less, in standard deviations",
+}
+"""What the keys of an estimator are, where their type says too little."""
+
+FEW = 8
+"""States up to which a template has the whole of P0."""
 
 RUN = """\
 # [enforcement]                 # (run only) samples that are authenticated, so never falsified:
@@ -110,7 +134,7 @@ def scenario_text(kind: str | None) -> str:
             known = [name for parts in SECTIONS.values() for name in parts]
             raise InputError("new", "KIND", repr(kind), one_of(known, kind))
         kinds[section] = kind
-        kinds["plant"] = NEEDS.get(kind, kinds["plant"])
+        kinds |= NEEDS.get(kind, {})
     build = SECTIONS["plant"][kinds["plant"]]
     example = EXAMPLES.get(kinds["plant"], {})
     plant_text = LINEAR
@@ -120,10 +144,10 @@ def scenario_text(kind: str | None) -> str:
     start = _start(plant) | {name: example[name] for name in ("x0",) if name in example}
     if "x0" in example:
         plant_text += _line("x0", example["x0"], "the true initial state (run only)") + "\n"
-    estimator = SECTIONS["estimator"][kinds["estimator"]](plant, *map(np.asarray, start.values()))
-    notes = {"x0": "estimate one sample before the first row", "P0": "and its covariance"}
     build = SECTIONS["estimator"][kinds["estimator"]]
-    parts = [HEAD, plant_text, _table("estimator", kinds["estimator"], build, 1, start, notes)]
+    begin = np.asarray(start["x0"]), np.eye(len(plant.states))
+    estimator = build(plant, *begin)
+    parts = [HEAD, plant_text, _table("estimator", kinds["estimator"], build, 1, start, NOTES)]
     values: dict[str, Callable[..., dict[str, Any]]] = {
         "detector": lambda _: {"level": 0.01, "on": judged(estimator)},
         "controller": lambda build: _steering(build, plant),
@@ -153,7 +177,8 @@ def _identity(n: int) -> list[list[float]]:
 
 def _start(plant: Plant) -> dict[str, Any]:
     n = len(plant.states)
-    return {"x0": [0.0] * n, "P0": _identity(n)}
+    # of many states the diagonal alone
+    return {"x0": [0.0] * n, "P0": _identity(n) if n <= FEW else [1.0] * n}
 
 
 def _steering(build: Callable[..., Any], plant: Plant) -> dict[str, Any]:
@@ -216,7 +241,7 @@ def _table(
             and not fields[name].is_required()
         ):
             field = fields[name]
-            words = in_words(field.annotation)
+            words = notes.get(name) or in_words(field.annotation)
             if field.default is None:
                 lines.append(f"# {name} = ..".ljust(31) + f" # {words or 'default: none'}")
             elif section != "plant":
