@@ -134,20 +134,20 @@ def gains_of(
     P = sandwich(m.A, cov.P) + m.Q
     C = jnp.where(seen[:, None], s.C, 0.0)
     common = correction(P, C, s.R, at.whiten if isinstance(at, LinearPlant) else whitener, seen)
-    G, H = m.G * scale, jnp.where(seen[:, None], s.H * scale, 0.0)
-    authentic = jnp.any(trusted[:, None] & (s.H != 0), 0)
+    # what is authenticated arrives as it was sent
+    G, H = m.G * scale, jnp.where((seen & ~trusted)[:, None], s.H * scale, 0.0)
+    held = jax.vmap(lambda use: _held(use, trusted[:, None] & (s.H != 0)))(uses)
 
-    def columns(use, is_open, Z):
+    def columns(use, is_open, Z, held):
         known = jnp.where(use.now_on, G[:, use.now], 0.0)
         X = dot(m.A, Z[:n]) + dot(known, Z[n:])
         free = jnp.where(use.before_on & is_open, G[:, use.before], 0.0)
-        felt = jnp.where(use.now_on & ~authentic[use.now], H[:, use.now], 0.0)
+        felt = jnp.where(use.now_on & ~held, H[:, use.now], 0.0)
         Y = jnp.concatenate([dot(C, X), dot(C, free), felt], 1)
         return jnp.concatenate([X, free, jnp.zeros((n, b))], 1), Y
 
-    X, Y = jax.vmap(columns)(uses, cov.open, cov.Z)
+    X, Y = jax.vmap(columns)(uses, cov.open, cov.Z, held)
     own = jax.vmap(lambda X, Y: deviation(common.white, common.moves, X, Y, a + b))(X, Y)
-    held = uses.now_on & authentic[uses.now]
     told = ~own.unknown[:, a:] & uses.now_on & ~held
     carried = jnp.concatenate([jnp.zeros(uses.before.shape, bool), told], 1)
     Z = jax.vmap(lambda moves, root, kept: after(moves, root, kept, b))(
@@ -160,6 +160,14 @@ def gains_of(
     still = uses.before_on & ~settled
     left = Covariances(still, common.cov, Z)
     return Gains(common, spread, Y, own, held, jnp.max(lost)), left
+
+
+def _held(use: Uses, authentic: Bool[Array, "p nd"]) -> Bool[Array, " b"]:
+    """Attacks that an authenticated output rules out: those which alone could falsify it. What
+    several could have falsified says that they cancel there, not that each of them is 0.
+    """
+    reached = authentic[:, use.now] & use.now_on
+    return jnp.any(reached & (jnp.sum(reached, 1, keepdims=True) == 1), 0)
 
 
 def _shortened(plant, group, Z, columns):

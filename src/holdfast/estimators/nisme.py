@@ -39,6 +39,7 @@ from holdfast.estimators.bank import (
 from holdfast.estimators.believed import Hypotheses, Sets, first, one, record
 from holdfast.estimators.channels import reach
 from holdfast.estimators.hypotheses import Mode, Slots, arranged, modes_of
+from holdfast.estimators.mixing import check_mixing, mixed
 from holdfast.numerics.linalg import SMALL
 from holdfast.numerics.naming import sidak
 from holdfast.parts import Estimator, InvalidValue, Plant, step_zero
@@ -86,6 +87,7 @@ class Nisme(Estimator):
     transition: Float[Array, "modes modes"] | None
     likelihood: str = eqx.field(static=True)
     freeze: float = eqx.field(static=True)
+    mixing: bool = eqx.field(static=True)
     modes: tuple[str, ...] = eqx.field(static=True)
     named: tuple[str, ...] = eqx.field(static=True)
 
@@ -102,9 +104,8 @@ class Nisme(Estimator):
         even = jnp.full(len(self.modes), -math.log(len(self.modes)), float)
         kept = cov
         if self.freeze:
-            nothing = Observation.of(
-                np.zeros(len(self.plant.inputs)), np.zeros(len(self.plant.outputs))
-            )
+            sizes = (len(names) for names in (self.plant.inputs, self.plant.outputs))
+            nothing = jax.tree.map(jnp.asarray, Observation.of(*map(np.zeros, sizes)))
             best, k = self._best(even), jnp.asarray(1, jnp.int32)
             kept = Held(held_gains.empty(cov, *self._rules(means, best, k, nothing)))
         state = NismeState(step_zero(), means, even, kept)
@@ -113,19 +114,22 @@ class Nisme(Estimator):
     def step(self, state: NismeState, observation: Observation) -> tuple[NismeState, Estimate]:
         """One row of every filter, and Bayes' rule for the modes."""
         k = state.k + 1
-        best = self._best(state.log_p)
-        rules = self._rules(state.means, best, k, observation)
+        best, means = self._best(state.log_p), state.means
         if isinstance(state.kept, Held):
+            rules = self._rules(means, best, k, observation)
             memory = held_gains.refreshed(state.kept.value, *rules, observation, self.freeze)
             gains, kept = memory.gains, Held(memory)
         else:
-            gains, kept = rules[0](state.kept)
+            cov = state.kept
+            if self.mixing and self.transition is not None:
+                means, cov = mixed(means, cov, state.log_p, self.transition)
+            gains, kept = self._rules(means, best, k, observation)[0](cov)
         fitted = over_groups(
             self.plant,
             self.group,
             lambda group, means, g: fit(self.plant, group, means, g, k, observation, self.scale),
             self.group,
-            state.means,
+            means,
             gains,
         )
         log_p = self._updated(state.log_p, self._of_modes(getattr(fitted, self.likelihood)))
@@ -201,6 +205,7 @@ def build(
     likelihood: Literal["evidence", "paper", "quadratic"] = "evidence",
     attack_prior_sd: float | list[float] = 1.0,
     transition: float | list[list[float]] | None = None,
+    mixing: bool = False,
     bank: list[Any] | None = None,
     level: float = 0.01,
     freeze: float = 0.0,
@@ -213,10 +218,12 @@ def build(
     an attack may well be, in units of each channel, one number or one per channel.
     ``transition``: probability per row that the mode changes (to each other one alike), or a
     matrix whose row i says where mode i goes; without it probabilities only stay above
-    ``floor``. ``bank``: the modes that have a filter, all if not given; where there are fewer,
-    z-tests with ``level`` as false-alarm budget of a row name the channels really attacked
-    (`holdfast analyse` says which sets suffice). ``freeze``: hold gains that change by less
-    than about this part of a standard deviation; 0 computes them at every row.
+    ``floor``. ``mixing``: each filter starts a row from all of them, as the chain has it (the
+    interacting multiple model filter), so that none goes on from what a wrong mode has left;
+    for small plants. ``bank``: the modes that have a filter, all if not given; where there are
+    fewer, z-tests with ``level`` as false-alarm budget of a row name the channels really
+    attacked (`holdfast analyse` says which sets suffice). ``freeze``: hold gains that change by
+    less than about this part of a standard deviation; 0 computes them at every row.
 
     Raises `InvalidValue` for an unknown name, or a number out of range.
     """
@@ -233,6 +240,8 @@ def build(
     slots = arranged(run, found.moving, found.sensed, len(x0) + falsified > SMALL)
     places = np.zeros((len(run), 2), np.int32)
     places[slots.modes[slots.real]] = np.argwhere(slots.real)
+    if mixing:
+        check_mixing(transition, freeze, slots.modes.shape[1])
     return Nisme(
         plant=plant,
         x0=x0,
@@ -248,6 +257,7 @@ def build(
         transition=None if transition is None else _chain(transition, len(run)),
         likelihood=likelihood,
         freeze=float(freeze),
+        mixing=mixing,
         modes=tuple(m.name for m in run),
         named=tuple(m.name for m in listed),
     )
