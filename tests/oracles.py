@@ -153,3 +153,102 @@ def batch_estimate(m, x0, P0, u, y, seen, free_attack: bool = True, delay: int =
         answer.determined[order],
         answer.condition,
     )
+
+
+class Nise(NamedTuple):
+    """One row of `algorithm_1`; attacks as vectors over the plant's channels.
+
+    ``told`` (d_{1,k}) and ``found`` (d_{2,k-1}); three log-likelihoods: of (15) with its
+    normaliser, of the errata, and of a Kalman filter whose attacks have the prior.
+    """
+
+    x: np.ndarray
+    P: np.ndarray
+    told: np.ndarray
+    told_cov: np.ndarray
+    found: np.ndarray
+    found_cov: np.ndarray
+    paper: float
+    errata: float
+    kalman: float
+
+
+def log_normal(v, cov) -> float:
+    """The log-density of N(0, cov) at v."""
+    whole = np.linalg.slogdet(cov)[1] + len(v) * np.log(2 * np.pi)
+    return -0.5 * float(v @ np.linalg.solve(cov, v) + whole)
+
+
+def output_split(F, R):
+    """(6) or (7) for outputs that F d falsifies: T_1, T_2, singular values, V_1, V_2."""
+    U, s, Vt = np.linalg.svd(F)
+    r = int(np.sum(s > 1e-9 * max(1.0, np.max(s, initial=0.0))))
+    U1, U2 = U[:, :r], U[:, r:]
+    first = U1.T - U1.T @ R @ U2 @ np.linalg.solve(U2.T @ R @ U2, U2.T)
+    return first, U2.T, s[:r], Vt[:r].T, Vt[r:].T
+
+
+def algorithm_1(model, x, P, prior, u, y) -> list[Nise]:
+    """NISE's Algorithm 1 after the errata, its SVDs as they stand, with eps in A, G and Q.
+
+    ``model(k)``: the functions f(x, u, d), h(x, u), motion(x, u, d) = (A, G, Q) and sense(x, u) =
+    (C, H, R) of row k; a channel that the mode does not use has zero columns. ``prior``: variances
+    of the attacks. Every sample arrives, h is linear in what finds d_2, and what falsifies an
+    output is found in its row or the next. d_0 is as free as any other.
+    """
+    x, P, nd = np.asarray(x, float), np.asarray(P, float), len(prior)
+    joint, V1, V2, d1 = P, np.zeros((nd, 0)), np.eye(nd), np.zeros(0)
+    D, rows = np.diag(prior), []
+    for k, (inputs, sample) in enumerate(zip(u, y, strict=True), 1):
+        f, h, motion, sense = model(k)
+        A, G, Q = motion(x, inputs, V1 @ d1)
+        blind = f(x, inputs, V1 @ d1)
+        C, H, R = sense(blind, inputs)
+        moves = np.hstack([A, G @ V1])
+        before, nu = moves @ joint @ moves.T + Q, sample - h(blind, inputs)
+        F, size = np.hstack([C @ G @ V2, H]), V2.shape[1]
+        scale = np.block([[V2.T @ D @ V2, np.zeros((size, nd))], [np.zeros((nd, size)), D]])
+        kalman = log_normal(nu, C @ before @ C.T + R + F @ scale @ F.T)
+        # lines 1 to 5
+        T1, T2, sigma, W1, W2 = output_split(H, R)
+        S1, S2, bar, B1, _ = output_split(T2 @ C @ G @ V2, T2 @ R @ T2.T)
+        to_2, to_3 = S1 @ T2, S2 @ T2
+        G2, M2 = G @ V2 @ B1, np.diag(1 / bar)
+        d2 = M2 @ to_2 @ nu
+        C2, C3 = to_2 @ C, to_3 @ C
+        keep = np.eye(len(x)) - G2 @ M2 @ C2
+        noise_2 = M2 @ to_2 @ R @ to_2.T @ M2.T
+        ahead = keep @ before @ keep.T + G2 @ noise_2 @ G2.T
+        cross = -M2 @ C2 @ before @ keep.T + noise_2 @ G2.T
+        cov_2 = M2 @ C2 @ before @ C2.T @ M2.T + noise_2
+        predicted = blind + G2 @ d2
+        # lines 6 to 8, and d2 smoothed
+        nu_3, spread = to_3 @ nu - C3 @ G2 @ d2, C3 @ ahead @ C3.T + to_3 @ R @ to_3.T
+        L = np.linalg.solve(spread, C3 @ ahead).T
+        x = predicted + L @ nu_3
+        left = np.eye(len(x)) - L @ C3
+        P = left @ ahead @ left.T + L @ to_3 @ R @ to_3.T @ L.T
+        smooth = np.linalg.solve(spread, C3 @ cross.T).T
+        d2 = d2 + smooth @ nu_3
+        cov_2 = cov_2 - smooth @ spread @ smooth.T
+        # lines 9 to 12
+        M1, C1 = np.diag(1 / sigma), T1 @ C
+        d1 = M1 @ (T1 @ nu - C1 @ (x - blind))
+        cov_1 = M1 @ (C1 @ P @ C1.T + T1 @ R @ T1.T) @ M1.T
+        with_x = -P @ C1.T @ M1.T
+        joint = np.block([[P, with_x], [with_x.T, cov_1]])
+        # the evidence of the errata: d1 and d2 with their joint covariance
+        both = (cross - smooth @ spread @ L.T) @ -(M1 @ C1).T
+        attacks = np.concatenate([d2, d1])
+        cov = np.block([[cov_2, both], [both.T, cov_1]])
+        basis = V2 @ B1
+        cov[: len(d2), : len(d2)] += basis.T @ D @ basis
+        cov[len(d2) :, len(d2) :] += W1.T @ D @ W1
+        paper = log_normal(nu_3, spread)
+        errata = paper - np.sum(np.log(sigma)) - np.sum(np.log(bar)) + log_normal(attacks, cov)
+        rows.append(
+            Nise(x, P, W1 @ d1, W1 @ cov_1 @ W1.T, basis @ d2, basis @ cov_2 @ basis.T,
+                 paper, float(errata), kalman)
+        )  # fmt: skip
+        V1, V2 = W1, W2
+    return rows

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Key
 
 from holdfast.attacks import bias, sine, switch
 from holdfast.controllers import linearising
@@ -20,7 +20,7 @@ from holdfast.detectors import chi_square
 from holdfast.estimators import nisme
 from holdfast.loop import Monitor, Scenario, simulate
 from holdfast.numerics.linalg import mahalanobis
-from holdfast.parts import Attack, Estimator, Plant, step_zero
+from holdfast.parts import Attack, Estimator, Plant
 from holdfast.plants.library import swing
 from holdfast.records import Estimate, Observation
 
@@ -41,6 +41,9 @@ FLOOR = 1e-4
 FREEZE = 1e-4
 EVERY = 20
 """Rows from one whose residual is judged to the next."""
+PRINTED_FLOOR = 0.033
+PRINTED_Z, STRICT = 0.8, 0.99
+"""The floor of the paper, and confidence levels of a z-test: as printed, and a stricter one."""
 THREE = [SENSORS, ACTUATORS, {"switch": LINES}]
 FOUR = [[], *THREE]
 NAMES = ("none", "+".join(SENSORS), "+".join(ACTUATORS), LINES)
@@ -48,15 +51,18 @@ NAMES = ("none", "+".join(SENSORS), "+".join(ACTUATORS), LINES)
 ALL_SIX = [{"attacks": [*SENSORS, *ACTUATORS], "switch": name} for name in PLANT.positions]
 
 
+Rows = Float[Array, "seeds N m"] | np.ndarray
+
+
 class Drawn(NamedTuple):
     """Runs of the network, seeds first, then rows 1 to N: state, input, measurement, and the
     attack that a row can tell (of sensors at k, of actuators at k - 1).
     """
 
-    x: Float[Array, "seeds N n"]
-    u: Float[Array, "seeds N nu"]
-    y: Float[Array, "seeds N ny"]
-    d: Float[Array, "seeds N nd"]
+    x: Rows
+    u: Rows
+    y: Rows
+    d: Rows
 
 
 class Told(NamedTuple):
@@ -114,13 +120,13 @@ def attacks(spell: float = SPELL) -> tuple[Attack, ...]:
     )  # fmt: skip
 
 
-def keys(seeds: int) -> PRNGKeyArray:
+def keys(seeds: int) -> Key[Array, " seeds"]:
     """One key per seed; the first seeds stay the same where there are more."""
     return jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(0), jnp.arange(seeds))
 
 
 @eqx.filter_jit
-def drawn(seeds: PRNGKeyArray, given: tuple[Attack, ...], steps: int) -> Drawn:
+def drawn(seeds: Key[Array, " seeds"], given: tuple[Attack, ...], steps: int) -> Drawn:
     """The network under ``given`` attacks for ``steps`` samples, once per seed."""
     detector = chi_square.build(PLANT, on="attack")
 
@@ -130,6 +136,8 @@ def drawn(seeds: PRNGKeyArray, given: tuple[Attack, ...], steps: int) -> Drawn:
         x = x + START_SD * jax.random.normal(start, x.shape)
         monitor = Monitor(Measured(PLANT), detector)
         trace = simulate(Scenario(PLANT, x, monitor, linearising.build(PLANT), given), run, steps)
+        assert trace.x is not None
+        assert trace.injection is not None
         d = trace.injection.d
         moved = jnp.concatenate([jnp.zeros((1, 3)), d[:-1, 3:]])
         return Drawn(
@@ -143,7 +151,7 @@ def drawn(seeds: PRNGKeyArray, given: tuple[Attack, ...], steps: int) -> Drawn:
 def bank(modes: Any, prior: float = 1.0, **settings: Any) -> nisme.Nisme:
     """A bank from theta*, 1e-4 I, its attack prior so many times `PRIOR`."""
     x = swing.operating_point(PLANT)
-    given = {"floor": FLOOR, "freeze": FREEZE} | settings
+    given: dict[str, Any] = {"floor": FLOOR, "freeze": FREEZE} | settings
     sd = (prior * np.array(PRIOR)).tolist()
     return nisme.build(
         PLANT, x, START_SD**2 * np.eye(len(x)), modes=modes, attack_prior_sd=sd, **given
@@ -195,3 +203,88 @@ def of_case_1(mode: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
 def accuracy(right: np.ndarray, place: np.ndarray) -> np.ndarray:
     """The share of ``right`` rows (seeds x N) in each interval (seeds x 4)."""
     return np.stack([right[:, place == i].mean(1) for i in range(len(TRUE))], 1)
+
+
+class Amount(NamedTuple):
+    """Seeds of the four-mode bank, of all that it is compared with, and of the full bank, whose
+    other likelihoods are run with intervals of ``short`` seconds.
+    """
+
+    seeds: int = 10
+    few: int = 2
+    full: int = 3
+    short: float = 1.0
+
+
+class Said(NamedTuple):
+    """What a bank said: its modes by their number in case study 1, and ``right``: where true."""
+
+    mode: np.ndarray
+    right: np.ndarray
+    told: Told
+    place: np.ndarray
+
+    @property
+    def accuracy(self) -> np.ndarray:
+        """Seeds x 4."""
+        return accuracy(self.right, self.place)
+
+
+class Run(NamedTuple):
+    """The network, and by name what each bank said of it."""
+
+    drawn: Drawn
+    said: dict[str, Said]
+
+
+def at_each(level: float) -> float:
+    """The false-alarm budget of a row in which six tests have the confidence ``level`` each."""
+    return 1.0 - level ** len(PLANT.attacks)
+
+
+def banks() -> dict[str, Any]:
+    """The banks that are compared with the four-mode one, by name."""
+    four, reduced = FOUR, {"modes": "all", "bank": ALL_SIX}
+    found = {}
+    for likelihood in ("paper", "quadratic"):
+        found[f"four, {likelihood}"] = {"modes": four, "likelihood": likelihood}
+        printed = {"modes": THREE, "likelihood": likelihood, "floor": PRINTED_FLOOR}
+        found[f"three, {likelihood}"] = printed
+        found[f"reduced, {likelihood}"] = reduced | {"likelihood": likelihood}
+    for word, prior in (("x 10", 10.0), ("/ 10", 0.1)):
+        found[f"four, prior {word}"] = {"modes": four, "prior": prior}
+        found[f"reduced, prior {word}"] = reduced | {"prior": prior}
+    found["reduced"] = reduced
+    found["reduced, printed"] = reduced | {"level": at_each(PRINTED_Z)}
+    found["reduced, strict"] = reduced | {"level": at_each(STRICT)}
+    return found
+
+
+def drive(amount: Amount = Amount()) -> Run:  # noqa: B008
+    """Everything that is simulated and estimated."""
+    steps = round(SECONDS / PLANT.dt)
+    runs = drawn(keys(max(amount[:3])), attacks(), steps)
+    place = interval(steps)
+    said = {"four": asked(runs, place, amount.seeds, modes=FOUR)}
+    for name, settings in banks().items():
+        said[name] = asked(runs, place, amount.few, **settings)
+    said["full"] = asked(runs, place, amount.full, modes="all")
+    steps = round(4 * amount.short / PLANT.dt)
+    brief = drawn(keys(amount.few), attacks(amount.short), steps)
+    place = interval(steps, amount.short)
+    for likelihood in ("paper", "quadratic"):
+        found = asked(brief, place, amount.few, modes="all", likelihood=likelihood)
+        said[f"full, {likelihood}"] = found
+    return Run(runs, said)
+
+
+def asked(runs: Drawn, place: np.ndarray, seeds: int, **settings: Any) -> Said:
+    """A bank run over the first seeds."""
+    estimator = bank(**settings)
+    return judged_by(told(estimator, runs, seeds), estimator.named, place)
+
+
+def judged_by(told: Told, names: tuple[str, ...], place: np.ndarray) -> Said:
+    """What was said beside what was true."""
+    mode = of_case_1(told.mode, names)
+    return Said(mode, mode == true_modes(place), told, place)

@@ -17,6 +17,7 @@ DASHED = ("truth", "threshold", "course")
 COLOURS = (ALARM, MAIN, FAULT, "#009e73", ATTACK, LOST)
 MARKS = ((0, (4, 3)), (0, (1, 2)))
 """Dashes of the first and of the second vertical line."""
+DOTS = {"ls": "none", "marker": ".", "ms": 1.5}
 WIDTH, HEIGHT, TALL = 8.4, 2.1, 3.2
 FEW = 6
 """Labels on an axis of a plane, at most."""
@@ -26,7 +27,8 @@ DOTS_PER_INCH = 150
 class Panel(NamedTuple):
     """Series over time by name; those called as in `DASHED` are dashed.
 
-    ``x``: of this panel's series, where they have their own; ``marks``: vertical lines by name.
+    ``x``: of this panel's series, where they have their own; ``marks``: vertical lines by name;
+    ``dotted``: series that jump, as dots, but for those that are dashed.
     """
 
     title: str
@@ -34,6 +36,7 @@ class Panel(NamedTuple):
     log: bool = False
     x: np.ndarray | None = None
     marks: Mapping[str, float] = MappingProxyType({})
+    dotted: bool = False
 
 
 class Plane(NamedTuple):
@@ -121,7 +124,8 @@ def _drawn(
             if panel.log:
                 place.set_yscale("log")
             for name, values in panel.lines.items():
-                place.plot(own, values, label=name, **style[name])
+                dots = DOTS if panel.dotted and name not in DASHED else {}
+                place.plot(own, values, label=name, **style[name] | dots)
             for (name, at), dashes in zip(panel.marks.items(), MARKS, strict=False):
                 place.axvline(at, label=name, color=INK, lw=0.9, ls=dashes)
         axes[-1].set_xlabel(label)

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from holdfast.numerics.linalg import dot, sandwich
 from holdfast.parts import InvalidValue, Plant
+from holdfast.plants.angles import shorter_way
 
 INPUTS = ("v", "omega")
 SMALL = 0.05
@@ -70,10 +71,8 @@ class UnicyclePlant(Plant):
         return Q, jnp.diag(jnp.concatenate([far, jnp.full(far.shape, self.bearing_sd**2)]))
 
     def innovation(self, y, expected) -> Float[Array, " ny"]:
-        """Y - expected, bearings the shorter way round."""
-        apart, L = y - expected, len(self.landmarks)
-        turned = apart[L:] - 2 * jnp.pi * jnp.round(apart[L:] / (2 * jnp.pi))
-        return jnp.concatenate([apart[:L], turned])
+        """How far y is from what was expected, bearings the shorter way round."""
+        return shorter_way(y - expected, self.outputs, self.outputs[len(self.landmarks) :])
 
     def _moved(self, x, speeds) -> Float[Array, " 3"]:
         half = 0.5 * self.dt * speeds[1]
