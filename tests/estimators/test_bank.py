@@ -4,8 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import logsumexp
 
 import banks
+import oracles
 import systems
 from holdfast.detectors import chi_square
 from holdfast.estimators import nise, nisme
@@ -96,31 +98,38 @@ def test_matrices_that_move_with_time_or_a_schedule():
 
 @pytest.mark.slow
 def test_switch_positions_are_plants_of_their_own():
-    """The filters of a position are those of the plant that is always in it."""
+    """The filters of a position are those of the plant that is always in it, and so is their
+    evidence, whose common part is not common to all positions.
+    """
     base = banks.plant_of(6, 3, 4)
     A, B, C, D, G, H, Q, R = map(jnp.asarray, systems.matrices(base))
-    settings = dict(
-        Q=Q, R=R, dt=1.0, states=base.states, inputs=base.inputs, outputs=base.outputs,
-        attacks=banks.NAMES,
-    )  # fmt: skip
     factor = jnp.array([1.0, 0.5])
     plant = switched_plant(
         lambda x, u, d, j: factor[j] * (A @ x) + B @ u + G @ d,
         lambda x, u, d, j: C @ x / factor[j] + D @ u + H @ d,
-        positions=["closed", "open"], **settings,
+        positions=["closed", "open"], Q=Q, R=R, dt=1.0, states=base.states, inputs=base.inputs,
+        outputs=base.outputs, attacks=banks.NAMES,
     )  # fmt: skip
     tables = [{"attacks": m, "switch": p} for p in ("closed", "open") for m in banks.MODES[:3]]
-    observations = banks.observed(6, base, 40)
-    built = nisme.build(plant, np.ones(3), np.eye(3), modes=tables)
-    state = jax.tree.map(np.asarray, banks.ran(built, observations))[0]
+    u, y, _ = systems.random_log(6, base, 30)
+    built = nisme.build(plant, np.ones(3), np.eye(3), modes=tables, floor=1e-290)
+    state = jax.tree.map(np.asarray, banks.ran(built, banks.log(u, y)))[0]
+    evidence = []
     for number, entry in enumerate(tables):
         f = float(factor[plant.positions.index(entry["switch"])])
         alone = banks.plant_of(6, 3, 4, A=f * np.asarray(A), C=np.asarray(C) / f)
-        one = nise.build(alone, np.ones(3), np.eye(3), mode=entry["attacks"])
-        truth = np.asarray(banks.ran(one, observations)[1].x)
+        model = banks.linear(alone, entry["attacks"])
+        rows = oracles.algorithm_1(model, np.ones(3), np.eye(3), np.ones(3), u, y)
         s, j = np.asarray(built.places[number])
+        truth = np.array([row.x for row in rows])
         size = max(1.0, np.max(np.abs(truth)))
         np.testing.assert_allclose(state.means.x[:, s, j], truth, rtol=0, atol=1e-9 * size)
+        evidence.append([row.kalman for row in rows])
+    total = np.cumsum(np.array(evidence).T, 0)
+    wanted = total - logsumexp(total, axis=1, keepdims=True)
+    clear = wanted.min(1) > -600  # above the floor
+    assert clear[:5].all()
+    np.testing.assert_allclose(state.log_p[clear], wanted[clear], rtol=0, atol=1e-8)
 
 
 @pytest.mark.slow

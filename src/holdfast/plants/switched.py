@@ -73,7 +73,7 @@ class SwitchedPlant(Plant):
         return self.h(x, u, d, self.position)
 
     def innovation(self, y, expected) -> Float[Array, " ny"]:
-        """y - expected, angles the shorter way round."""
+        """How far y is from what was expected, angles the shorter way round."""
         return shorter_way(y - expected, self.outputs, self.angles)
 
     def confined(self, k, u, x) -> Float[Array, " n"]:
