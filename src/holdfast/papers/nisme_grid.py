@@ -159,15 +159,16 @@ def bank(modes: Any, prior: float = 1.0, **settings: Any) -> nisme.Nisme:
 
 
 def told(estimator: nisme.Nisme, runs: Drawn, seeds: int) -> Told:
-    """What a bank says of the first ``seeds`` runs."""
-    rows = jax.tree.map(jnp.asarray, Observation.of(runs.u[:seeds], runs.y[:seeds]))
-    return Told(*map(np.asarray, _told(estimator, rows)))
+    """What a bank says of the first ``seeds`` runs, one by one: one program serves any number."""
+    each = []
+    for u, y in zip(runs.u[:seeds], runs.y[:seeds], strict=True):
+        rows = jax.tree.map(jnp.asarray, Observation.of(u, y))
+        each.append(Told(*map(np.asarray, _told(estimator, rows))))
+    return Told(*map(np.stack, zip(*each, strict=True)))
 
 
 @eqx.filter_jit
 def _told(estimator: nisme.Nisme, observations: Observation):
-    """Seed by seed: batches of LAPACK calls can lock one another out."""
-
     def row(state, observation):
         state, e = estimator.step(state, observation)
         nis, dof = jax.lax.cond(
@@ -175,14 +176,10 @@ def _told(estimator: nisme.Nisme, observations: Observation):
             lambda: mahalanobis(e.residual, e.residual_cov),
             lambda: (jnp.asarray(0.0), jnp.asarray(0)),
         )
-        variance = jnp.diagonal(e.d_cov)
         size, _ = mahalanobis(e.d, e.d_cov)
-        return state, (e.mode, e.p, e.x, e.d, jnp.sqrt(variance), size, nis, dof)
+        return state, (e.mode, e.p, e.x, e.d, jnp.sqrt(jnp.diagonal(e.d_cov)), size, nis, dof)
 
-    def one(rows):
-        return jax.lax.scan(row, estimator.init()[0], rows)[1]
-
-    return jax.lax.map(one, observations)
+    return jax.lax.scan(row, estimator.init()[0], observations)[1]
 
 
 def interval(steps: int, spell: float = SPELL) -> np.ndarray:
