@@ -32,7 +32,7 @@ def check_nise(plant, modes, observations, x0, P0, tolerance=1e-9):
     Both recursions are exact; 1e-9 is a thousand times what rounding leaves of the worst.
     """
     n = len(plant.states)
-    built = nisme.build(plant, x0, P0, modes=modes, floor=0.1)
+    built = nisme.build(plant, x0, P0, modes=modes, floor=0.1, attack_prior_sd=[0.5, 2.0, 3.0])
     state, got = jax.tree.map(np.asarray, banks.ran(built, observations))
     believed = set()
     for number, mode in enumerate(modes):

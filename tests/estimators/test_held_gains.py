@@ -146,9 +146,12 @@ def test_gains_thaw_where_the_linearised_plant_moves():
 
 
 def rooted():
-    """x moves by the square root of 50 and the input: no number where that is negative."""
+    """x moves by the square root of 50 and the input: no number where that is negative, nor then
+    a slope of what is measured.
+    """
     return nonlinear_plant(
-        lambda x, u, d: 0.9 * x + jnp.sqrt(u + 50), lambda x, u, d: jnp.stack([x[0] + d[0], x[0]]),
+        lambda x, u, d: 0.9 * x + jnp.sqrt(u + 50),
+        lambda x, u, d: jnp.stack([x[0] + d[0], x[0] + 0.01 * x[0] ** 2]),
         Q=[[0.1]], R=np.eye(2), dt=1.0, states=["x"], inputs=["u"], outputs=["a", "b"],
         attacks=["spoof"],
     )  # fmt: skip
@@ -160,7 +163,7 @@ def test_a_row_without_numbers_is_told_and_gone_afterwards(freeze):
     """DIVERGED in that row alone; then as if it had not been."""
     plant = rooted()
     rng = np.random.default_rng(0)
-    u, y = np.full((60, 1), -49.0), 10.0 + rng.normal(size=(60, 2))
+    u, y = np.full((60, 1), -49.0), np.array([10.0, 11.0]) + rng.normal(size=(60, 2))
     monitor = Monitor(build(plant, freeze), chi_square.build(plant, on="residual"))
     truth = replay(monitor, banks.log(u, y)).estimate
     u[30] = -60.0

@@ -24,7 +24,7 @@ from holdfast.plants.library import swing
 from holdfast.records import Observation, Status
 from holdfast.shell.live import Live
 
-SD = np.array([0.5, 2.0, 1.0])
+SD = np.array([0.5, 2.0, 3.0])
 LEAST = 1e-290
 """A floor that nothing reaches."""
 

@@ -180,3 +180,24 @@ def test_a_factor_is_shortened_without_loss_or_by_the_least():
     # the two smallest of four parts, none of it gained
     np.testing.assert_allclose(left, [0, 0, *values[:2]], rtol=0, atol=1e-13 * values[-1])
     np.testing.assert_allclose(lost, values[:2].sum() / values.sum(), rtol=1e-11)
+
+
+def test_an_uncertainty_far_beyond_the_noise_is_still_measured():
+    """Columns of 1e7 beside noise of 1, in directions that differ by 1e-4 of them: what the row
+    leaves of each is near its noise. A relative test of pivots would call the second known.
+    """
+    n, p, z, r = SMALLEST
+    P, C, R, X, Y = problem(6, n, p, z, r)
+    X[:, 1] = X[:, 0] + 1e-6 * X[:, 1]
+    X[:, :z] *= 1e7
+    Y[:, :z] = C @ X[:, :z]
+    common, own, Z = jax.tree.map(np.asarray, found(P, C, R, X, Y, np.ones(r, bool)))
+    e = common.white @ np.random.default_rng(3).normal(size=p)
+    S = np.eye(p) + (common.white @ Y[:, :z]) @ (common.white @ Y[:, :z]).T
+    sign, size = np.linalg.slogdet(S)
+    assert sign > 0
+    # a condition of 1e14 leaves two digits of what the second column alone measures
+    assert own.log_det == pytest.approx(size, abs=0.1)
+    z_scores = own.scores[:, :z].T @ e
+    assert e @ e - z_scores @ z_scores == pytest.approx(e @ np.linalg.solve(S, e), rel=0.1)
+    assert np.all(np.isfinite(Z))

@@ -22,7 +22,14 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from holdfast.numerics.linalg import dot, lower_factor, lower_inverse, one_at_a_time, symmetric
+from holdfast.numerics.linalg import (
+    dot,
+    lower_factor,
+    lower_inverse,
+    one_at_a_time,
+    repeat,
+    symmetric,
+)
 from holdfast.numerics.square_root import triangle
 
 INSEPARABLE = 1e-5
@@ -67,7 +74,7 @@ def deviation(
     B = dot(white, Y)
     X = X - dot(common, B)
     uncertain, attacked = B[:, :z], B[:, z:]
-    lower = lower_factor(jnp.eye(z) + _gram(uncertain, uncertain))[0]
+    lower = _beyond_identity(_gram(uncertain, uncertain))
     inverse = lower_inverse(lower)
     R = dot(inverse, _gram(uncertain, attacked))
     D_z, X_z = dot(uncertain, inverse.T), dot(X[:, :z], inverse.T)
@@ -78,8 +85,6 @@ def deviation(
     # unit information, or as much as the factor of a number 1e10 times larger can hold
     added = jnp.maximum(1.0, 1e-8 * jnp.diagonal(Sigma))
     root = lower_factor(Sigma + jnp.diag(jnp.where(dependent, added, 0.0)))[0]
-    prior, found = lower_factor(Sigma + jnp.eye(r))
-    prior = prior + jnp.diag(jnp.where(found, 0.0, 1.0))
     F = jnp.where(dependent, 0.0, Y[:, z:])
     size = lower_factor(_gram(F, F) + jnp.diag(jnp.where(dependent, 1.0, 0.0)))[0]
     known = jnp.where(dependent, 1.0, jnp.diagonal(root) / jnp.diagonal(size))
@@ -87,12 +92,27 @@ def deviation(
         jnp.concatenate([D_z, D_f], 1),
         jnp.concatenate([X_z, X_f], 1),
         root,
-        prior,
+        _beyond_identity(Sigma),
         dependent,
         unknown,
         2.0 * jnp.sum(jnp.log(jnp.diagonal(lower))),
         2.0 * jnp.sum(jnp.log(known)),
     )
+
+
+def _beyond_identity(p: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    """L with L L' = I + P. No pivot is under 1, however small beside its row: a relative test, as
+    in `lower_factor`, would give up what is known where P is 1e10 and more in one direction.
+    """
+    rows, whole = jnp.arange(p.shape[0]), p + jnp.eye(p.shape[0])
+
+    def column(j, lower):
+        rest = whole[:, j] - dot(lower, lower[j])
+        root = jnp.sqrt(jnp.maximum(rest[j], 1.0))
+        entries = jnp.where(rows > j, rest / root, jnp.where(rows == j, root, 0.0))
+        return lower.at[:, j].set(entries)
+
+    return repeat(p.shape[0], column, jnp.zeros_like(p))
 
 
 def inseparable(
