@@ -1,5 +1,7 @@
 """Filters that share what they can, against one NISE per mode; where the two part company."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -277,6 +279,24 @@ def test_hard_cases_stay_finite(likelihood, freeze):
             assert np.all(np.diagonal(cov, axis1=1, axis2=2) >= 0), name
         np.testing.assert_allclose(got.p.sum(1), 1.0, rtol=0, atol=1e-12, err_msg=name)
         assert not np.any(got.status & int(Status.DIVERGED)), name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("n", "ny"), [(3, 4), (11, 5)])
+def test_noise_that_rounding_hides_leaves_no_nan(n, ny):
+    """P up to 1e36 times the noise: digits are lost, not the filter."""
+    for seed, R, P0, Q, C in itertools.product(
+        (1, 2), (1e-16, 1e-6), (1.0, 1e12), (1.0, 0.0), (1.0, 1e4)
+    ):
+        base = banks.plant_of(seed, n, ny)
+        plant = banks.plant_of(
+            seed, n, ny, R=R * np.eye(ny), Q=Q * np.asarray(base.Q), C=C * np.asarray(base.C)
+        )
+        u, y, _ = systems.random_log(seed, plant, 40)
+        built = nisme.build(plant, np.zeros(n), P0 * np.eye(n), modes=banks.MODES)
+        got = jax.tree.map(np.asarray, banks.ran(built, banks.log(u, y))[1])
+        for part in ("x", "d", "residual", "residual_cov", "p"):
+            assert np.all(np.isfinite(getattr(got, part))), (part, seed, R, P0, Q, C)
 
 
 @pytest.mark.slow

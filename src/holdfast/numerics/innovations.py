@@ -9,11 +9,18 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from holdfast.numerics.linalg import SMALL, dot, one_at_a_time, repeat, sandwich, symmetric
+
+
+ROUNDING = 1e-14
+"""Share of |C| |P| |C'| below which C P C' is the rounding of what it is a difference of. A row
+about which no more is known before it than that is not used: its gain would be noise, of any
+size. It takes a P of 1e14 times the noise."""
 
 
 class Correction(NamedTuple):
@@ -61,7 +68,10 @@ def _row_by_row(P, C, W, W_inverse, seen) -> Correction:
         P, gain, white, moves, log_det = carry
         h, here = M[i], rows == i
         along = dot(P, h)
-        spread = dot(h, along) + 1.0
+        known = dot(h, along)
+        told = known > ROUNDING * dot(jnp.abs(h), dot(jnp.abs(P), jnp.abs(h)))
+        along = jnp.where(told, along, 0.0)
+        spread = jnp.where(told, known, 0.0) + 1.0
         k, rest = along / spread, jnp.where(here, 1.0, 0.0) - dot(h, gain)
         kept = P - k[:, None] * along
         P = kept + (k - dot(kept, h))[:, None] * k  # Joseph's form, with unit noise
@@ -79,16 +89,29 @@ def _row_by_row(P, C, W, W_inverse, seen) -> Correction:
 
 @one_at_a_time
 def _factorised(P, C, R, seen) -> Correction:
-    R = jnp.where(seen[:, None] & seen[None, :], R, 0.0)
-    CP = C @ P
-    S = symmetric(CP @ C.T) + R + jnp.diag(jnp.where(seen, 0.0, 1.0))
-    lower = jnp.linalg.cholesky(S)
-    white = solve_triangular(lower, jnp.diag(seen.astype(float)), lower=True)
-    moves = (white @ CP).T
-    gain = moves @ white
-    log_det = 2.0 * jnp.sum(jnp.log(jnp.diagonal(lower))) + _constant(seen)
-    cov = sandwich(jnp.eye(P.shape[0]) - gain @ C, P) + sandwich(gain, R)
-    return Correction(white, moves, cov, log_det)
+    """From the factor of S, unless it hides the noise: then row by row."""
+    CP, noise = C @ P, jnp.where(seen[:, None] & seen[None, :], R, jnp.diag(~seen * 1.0))
+    known = symmetric(CP @ C.T)
+    lower = jnp.linalg.cholesky(known + noise)
+    kept = jnp.all(ROUNDING * jnp.diagonal(known) < jnp.diagonal(noise))
+
+    def whole():
+        white = solve_triangular(lower, jnp.diag(seen.astype(float)), lower=True)
+        moves = (white @ CP).T
+        gain = moves @ white
+        log_det = 2.0 * jnp.sum(jnp.log(jnp.diagonal(lower))) + _constant(seen)
+        cov = sandwich(jnp.eye(P.shape[0]) - gain @ C, P) + sandwich(gain, noise)
+        return Correction(white, moves, cov, log_det)
+
+    def slow():
+        half = jnp.linalg.cholesky(noise)
+        inverse = solve_triangular(half, jnp.diag(seen.astype(float)), lower=True)
+        found = _row_by_row(P, C, inverse, half, seen)
+        # what rounding has left of P is not known: a variance, or P would be indefinite
+        left = ROUNDING * jnp.max(jnp.diagonal(P)) * jnp.eye(P.shape[0])
+        return found._replace(cov=found.cov + left)
+
+    return jax.lax.cond(kept & jnp.all(jnp.isfinite(lower)), whole, slow)
 
 
 def _constant(seen: Bool[Array, " p"]) -> Float[Array, ""]:
