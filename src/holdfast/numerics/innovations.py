@@ -14,8 +14,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
-from holdfast.numerics.linalg import SMALL, dot, one_at_a_time, repeat, sandwich, symmetric
-
+from holdfast.numerics.linalg import SMALL, dot, one_at_a_time, repeat, symmetric
 
 ROUNDING = 1e-14
 """Share of |C| |P| |C'| below which C P C' is the rounding of what it is a difference of. A row
@@ -90,7 +89,8 @@ def _row_by_row(P, C, W, W_inverse, seen) -> Correction:
 @one_at_a_time
 def _factorised(P, C, R, seen) -> Correction:
     """From the factor of S, unless it hides the noise: then row by row."""
-    CP, noise = C @ P, jnp.where(seen[:, None] & seen[None, :], R, jnp.diag(~seen * 1.0))
+    CP, noise = C @ P, jnp.where(seen[:, None] & seen[None, :], R, 0.0)
+    noise = noise + jnp.diag(jnp.where(seen, 0.0, 1.0))
     known = symmetric(CP @ C.T)
     lower = jnp.linalg.cholesky(known + noise)
     kept = jnp.all(ROUNDING * jnp.diagonal(known) < jnp.diagonal(noise))
@@ -100,7 +100,8 @@ def _factorised(P, C, R, seen) -> Correction:
         moves = (white @ CP).T
         gain = moves @ white
         log_det = 2.0 * jnp.sum(jnp.log(jnp.diagonal(lower))) + _constant(seen)
-        cov = sandwich(jnp.eye(P.shape[0]) - gain @ C, P) + sandwich(gain, noise)
+        rest = P - gain @ CP  # (I - KC) P; then Joseph's form, in fewer products
+        cov = symmetric(rest - (rest @ C.T - _times(gain, noise)) @ gain.T)
         return Correction(white, moves, cov, log_det)
 
     def slow():
@@ -112,6 +113,13 @@ def _factorised(P, C, R, seen) -> Correction:
         return found._replace(cov=found.cov + left)
 
     return jax.lax.cond(kept & jnp.all(jnp.isfinite(lower)), whole, slow)
+
+
+def _times(gain, noise):
+    """K R, at once where no sensor shares its noise with another."""
+    alone = jnp.diagonal(noise)
+    shared = jnp.any(noise != jnp.diag(alone))
+    return jax.lax.cond(shared, lambda: gain @ noise, lambda: gain * alone)
 
 
 def _constant(seen: Bool[Array, " p"]) -> Float[Array, ""]:
