@@ -29,6 +29,10 @@ from holdfast.plants.local import motion, sensing
 from holdfast.records import Observation
 
 
+FEW = 4
+"""Groups that are written out: each costs its own time to compile."""
+
+
 class Uses(eqx.Module):
     """The channels that modes take for attacked, by number; what a mode does not use is off.
 
@@ -104,13 +108,20 @@ def one_by_one(plant: Plant, group: Group) -> bool:
     return len(plant.states) + group.uses.now.shape[-1] <= SMALL
 
 
-def over_groups(plant: Plant, group: Group, function, *arguments):
+def over_groups(plant: Plant, group: Group, function, *arguments, apart: bool = False):
     """``function`` of every group: batched where groups are small, in turn where they are large
     (batches of LAPACK calls can lock one another out).
+
+    ``apart``: few large groups are written out. Much arithmetic on few matrices is faster so (a
+    loop copies them in and out), the other way round slower.
     """
     if one_by_one(plant, group):
         return jax.vmap(function)(*arguments)
-    return jax.lax.map(lambda each: function(*each), arguments)
+    count = len(group.position)
+    if count > FEW or not apart:
+        return jax.lax.map(lambda each: function(*each), arguments)
+    each = (jax.tree.map(lambda leaf: leaf[i], arguments) for i in range(count))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(function(*one) for one in each))
 
 
 def physical(plant: Plant, uses: Uses, d: Float[Array, " b"], scale) -> Float[Array, " nd"]:

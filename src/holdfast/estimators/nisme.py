@@ -48,6 +48,8 @@ from holdfast.records import Estimate, Held, Observation, Status
 WIDTH = 3
 """Columns kept for every channel of a large plant: what a filter's covariance has beyond the
 common one falls off as the common filter forgets."""
+LIKELIHOODS = ("evidence", "paper", "quadratic")
+"""What modes may be weighed by, by number in `Nisme.likelihood`: one program serves all."""
 LOST = 1e-6
 """Share of a filter's own covariance that may be given up for that before a row says so."""
 
@@ -70,7 +72,8 @@ class Nisme(Estimator):
     are a mode's. ``scale``: the prior standard deviation of every channel. Probabilities are
     cut from below at ``floor`` and normalised, after a step of the Markov chain ``transition``
     where there is one. ``hypotheses``: what `Estimate.mode` counts; where the bank has fewer
-    modes, z-tests on the attack against ``limits`` say which of them it is.
+    modes, z-tests on the attack against ``limits`` say which of them it is. ``likelihood``: the
+    number of what weighs them in `LIKELIHOODS`.
     """
 
     plant: Plant
@@ -85,7 +88,7 @@ class Nisme(Estimator):
     scale: Float[Array, " nd"]
     floor: Float[Array, ""]
     transition: Float[Array, "modes modes"] | None
-    likelihood: str = eqx.field(static=True)
+    likelihood: Int[Array, ""]
     freeze: float = eqx.field(static=True)
     mixing: bool = eqx.field(static=True)
     modes: tuple[str, ...] = eqx.field(static=True)
@@ -132,7 +135,8 @@ class Nisme(Estimator):
             means,
             gains,
         )
-        log_p = self._updated(state.log_p, self._of_modes(getattr(fitted, self.likelihood)))
+        likely = jnp.stack([getattr(fitted, name) for name in LIKELIHOODS])[self.likelihood]
+        log_p = self._updated(state.log_p, self._of_modes(likely))
         uses = self.group.uses
         told = uses.now_on & ~gains.held & ~gains.own.unknown[..., uses.before.shape[-1] :]
         d = jnp.where(told, fitted.attack[..., uses.before.shape[-1] :], 0.0)
@@ -163,6 +167,7 @@ class Nisme(Estimator):
                 means,
                 cov,
                 best,
+                apart=True,
             )
 
         def slope(cov, gains):
@@ -233,6 +238,8 @@ def build(
     hypotheses = None if bank is None else _hypotheses(plant, listed, run, level)
     if not 0.0 < floor < 1.0 / len(run):
         raise InvalidValue("floor", floor, f"a number above 0 and under 1/{len(run)}, one per mode")
+    if likelihood not in LIKELIHOODS:
+        raise InvalidValue("likelihood", repr(likelihood), f"one of {', '.join(LIKELIHOODS)}")
     if not 0.0 <= freeze < 1.0:
         raise InvalidValue("freeze", freeze, "a part of a standard deviation, 0 for never")
     found = reach(plant, np.asarray(x0), [m.position for m in run], [m.active for m in run])
@@ -255,7 +262,7 @@ def build(
         scale=_scale(plant, attack_prior_sd),
         floor=jnp.asarray(float(floor)),
         transition=None if transition is None else _chain(transition, len(run)),
-        likelihood=likelihood,
+        likelihood=jnp.asarray(LIKELIHOODS.index(likelihood)),
         freeze=float(freeze),
         mixing=mixing,
         modes=tuple(m.name for m in run),

@@ -8,7 +8,9 @@ from holdfast.papers import nisme_assumptions as conditions
 from holdfast.papers import nisme_cases as studies
 from holdfast.papers import nisme_claims as claims
 from holdfast.papers import nisme_derivation as derivation
+from holdfast.papers import nisme_figures as drawn
 from holdfast.papers import nisme_filter as lines
+from holdfast.papers import nisme_grid as grid
 from holdfast.papers import nisme_modes as modes
 from holdfast.papers import nisme_stability as stability
 from holdfast.papers import nisme_tests as tests
@@ -29,15 +31,16 @@ LAST = "Remark 7.1"
 
 
 def study() -> Study:
-    """All rows."""
-    return Study(judged(), dict)
+    """All rows, and Figs. 4 to 7."""
+    run = grid.drive()
+    return Study(judged(run), lambda: drawn.figures(run))
 
 
-def judged() -> tuple[Row, ...]:
-    """All rows in the paper's order."""
+def judged(run: grid.Run) -> tuple[Row, ...]:
+    """All rows in the paper's order, those of the case studies from a run."""
     rows = ordered(statements())
     until = sum(_place(row)[0] <= ORDER.index(LAST) for row in rows)
-    return (*rows[:until], *studies.cases(), *rows[until:])
+    return (*rows[:until], *studies.judged(run), *rows[until:])
 
 
 def ordered(rows: list[Row]) -> tuple[Row, ...]:
