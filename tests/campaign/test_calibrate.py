@@ -39,7 +39,7 @@ def check(name, on, estimator, runs, steps):
     ("name", "on", "estimator", "method"),
     [
         ("windowed", "residual", "kalman", "exact"),
-        ("sprt", "attack", "unknown_input", "simulated"),
+        pytest.param("sprt", "attack", "unknown_input", "simulated", marks=pytest.mark.slow),
     ],
 )
 def test_the_false_alarm_rate_is_the_level(name, on, estimator, method):

@@ -56,7 +56,10 @@ def nees(error, cov):
     return np.einsum("ri,rij,rj->r", error, np.linalg.inv(cov), error)
 
 
-@pytest.mark.parametrize("name", LIMITS)
+@pytest.mark.parametrize(
+    "name",
+    [name if name == "both" else pytest.param(name, marks=pytest.mark.slow) for name in LIMITS],
+)
 def test_moments_are_honest(name):
     """Mean NEES within 3 standard errors of n: exact quadrature, and expectation propagation."""
     got, of_x, of_d = experiment(name, "moments")

@@ -15,6 +15,7 @@ from holdfast.papers import care_stability as stability
 from holdfast.papers import care_table as table
 from holdfast.papers.care_vehicle import MEASUREMENT, PROCESS, STATE_ROWS, Setting, drive
 
+pytestmark = pytest.mark.slow  # whole studies are computed
 LISTED = tomllib.loads((Path(__file__).parent / "care_statements.toml").read_text())["statement"]
 EYE = np.eye(2)
 OPPOSITE = {

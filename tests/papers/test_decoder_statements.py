@@ -24,6 +24,7 @@ from holdfast.report.tables import json_safe
 LIST = Path(__file__).parent / "decoder_statements.toml"
 EVERY: list[dict[str, str]] = tomllib.loads(LIST.read_text())["statement"]
 # the others fly and filter: `test_decoder_uav` has them, and the whole run below
+pytestmark = pytest.mark.slow  # whole studies are computed
 LISTED = [statement for statement in EVERY if "runs" not in statement]
 OPPOSITE = {
     "holds": "fails",
@@ -248,7 +249,6 @@ def _as_the_command_gives_them() -> list[Row]:
     return [Row(**row) for row in json.loads(done.stdout)]
 
 
-@pytest.mark.slow
 def test_the_page_on_the_papers_tells_the_numbers_of_the_whole_run():
     rows = {row.id: row for row in _as_the_command_gives_them()}
     assert [(id, row.verdict) for id, row in rows.items()] == [

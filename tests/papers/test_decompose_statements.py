@@ -24,6 +24,7 @@ from holdfast.papers.decompose_example import (
 )
 from holdfast.report.tables import json_safe
 
+pytestmark = pytest.mark.slow  # whole studies are computed
 LISTED = tomllib.loads((Path(__file__).parent / "decompose_statements.toml").read_text())
 LISTED = LISTED["statement"]
 OPPOSITE = {
@@ -231,7 +232,6 @@ def test_the_page_on_the_papers_tells_what_does_not_depend_on_draws(found):
     assert f"{len(found)} rows" in PAGE
 
 
-@pytest.mark.slow
 def test_the_page_on_the_papers_tells_the_numbers_of_the_whole_run(found):
     rows = {row.id: row for row in decompose.study().rows}
     assert {id: row.verdict for id, row in rows.items()} == {

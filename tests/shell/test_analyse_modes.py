@@ -39,6 +39,36 @@ def test_the_field():
     }
 
 
+def test_an_assumption_that_is_not_met_is_said(tmp_path, command):
+    """Of the channels that the scenario's estimator assumes attacked."""
+    path = tmp_path / "still.toml"
+    path.write_text(STILL)
+    code, out, err = command("analyse", path)
+    assert (code, err) == (0, "")
+    said = " ".join(out.split())
+    assert "With d1 attacked, Assumption 5.2 of NISE is not met: the process noise has no" in said
+
+
+STILL = """
+[plant]
+kind = "linear"
+dt = 1.0
+A = [[0.9]]
+C = [[1.0]]
+G = [[1.0]]
+Q = [[0.0]]
+R = [[1.0]]
+
+[estimator]
+kind = "nise"
+x0 = [0.0]
+P0 = [[1.0]]
+
+[detector]
+kind = "chi_square"
+"""
+
+
 def test_more_channels_than_are_listed():
     wide = quiet_plant(A=0.5 * np.eye(2), C=np.eye(2), G=np.ones((2, 13)), Q=np.eye(2), R=np.eye(2))
     modes = modes_content(reduce(wide, np.zeros(2), most=MOST))
