@@ -28,7 +28,6 @@ from holdfast.plants.linear import LinearPlant
 from holdfast.plants.local import motion, sensing
 from holdfast.records import Observation
 
-
 FEW = 4
 """Groups that are written out: each costs its own time to compile."""
 
@@ -120,8 +119,9 @@ def over_groups(plant: Plant, group: Group, function, *arguments, apart: bool = 
     count = len(group.position)
     if count > FEW or not apart:
         return jax.lax.map(lambda each: function(*each), arguments)
-    each = (jax.tree.map(lambda leaf: leaf[i], arguments) for i in range(count))
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(function(*one) for one in each))
+    leaves, shape = jax.tree.flatten(arguments)
+    found = [function(*shape.unflatten(parts)) for parts in zip(*leaves, strict=True)]
+    return jax.tree.map(lambda *parts: jnp.stack(parts), *found)
 
 
 def physical(plant: Plant, uses: Uses, d: Float[Array, " b"], scale) -> Float[Array, " nd"]:
