@@ -220,6 +220,38 @@ def policy(
 
 
 @app.command()
+def campaign(
+    study: Annotated[str, typer.Argument(help="Study file (TOML).", show_default=False)],
+    output: Annotated[
+        str | None,
+        typer.Option(
+            "-o", help="Folder for results and report; one that is there is gone on with. "
+            "Default: print the summary.", show_default=False,
+        ),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            "--scheduler", help="Address of a Dask scheduler. Default: this machine.",
+            show_default=False,
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            "--workers", min=1, help="Blocks at a time here. Default: one per core.",
+            show_default=False,
+        ),
+    ] = None,
+    allow_python: AllowPython = False,
+) -> None:  # fmt: skip
+    """Simulate a scenario many times over a grid of settings."""
+    from holdfast.shell import campaigning
+
+    campaigning.campaign(study, output, scheduler, workers, allow_python)
+
+
+@app.command()
 def papers(
     name: Annotated[
         str | None,

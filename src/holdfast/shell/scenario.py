@@ -59,19 +59,44 @@ def read_scenario(path: str | Path, *, allow_python: bool = False) -> ScenarioFi
     ``allow_python`` lets ``kind = "python"`` import and call code.
     """
     path = str(path)
+    source, content = read_content(path)
+    return build_scenario(path, source, content, allow_python)
+
+
+def read_content(path: str) -> tuple[str, dict[str, Any]]:
+    """The text of a scenario file, and its tables as they stand. Raises `InputError`."""
     source = decode(read_bytes(path, SCENARIO_LIMIT, WHAT), path, WHAT)
-    folder = Path() if path == STANDARD_INPUT else Path(path).parent
+    return source, parsed(source, path)
+
+
+def parsed(source: str, path: str) -> dict[str, Any]:
+    """The tables of a scenario's text. Raises `InputError`."""
     if _DEEP_KEY.search(source):
         raise _too_deep(path)
     try:
         content = tomllib.loads(source)
+        reject_unusable(content, path)
     except RecursionError:
         raise _too_deep(path) from None
     except ValueError as error:  # not TOML, or a number of more digits than Python converts
         raise InputError(path, "", f"no TOML: {error}", WHAT) from None
+    return content
+
+
+def build_scenario(
+    path: str,
+    source: str,
+    content: dict[str, Any],
+    allow_python: bool,
+    plant: Plant | None = None,
+) -> ScenarioFile:
+    """Build what the tables say. Raises `InputError`.
+
+    ``plant``: one that has been built from the same [plant] before.
+    """
+    folder = Path() if path == STANDARD_INPUT else Path(path).parent
     try:
-        reject_unusable(content, path)
-        return _build(path, folder, source, content, allow_python)
+        return _build(path, folder, source, content, allow_python, plant)
     except RecursionError:
         raise _too_deep(path) from None
 
@@ -81,13 +106,14 @@ def _too_deep(path: str) -> InputError:
 
 
 def _build(
-    path: str, folder: Path, source: str, content: dict[str, Any], allow_python: bool
-) -> ScenarioFile:
+    path: str, folder: Path, source: str, content: dict[str, Any], allow_python: bool,
+    known: Plant | None,
+) -> ScenarioFile:  # fmt: skip
     sections: Any = Table(path, "", content, folder).checked(ScenarioTables)
     run: Any = Table(path, "run", sections.run, folder).checked(RunSettings)
     plant_table = Table(path, "plant", sections.plant, folder)
     x0 = plant_table.values.pop("x0", None)
-    plant = _plant(plant_table, allow_python)
+    plant = _plant(plant_table, allow_python) if known is None else known
     n = len(plant.states)
     start = np.zeros(n) if x0 is None else plant_table.array("x0", x0, (n,))
     estimator = _estimator(Table(path, "estimator", sections.estimator, folder), plant)
