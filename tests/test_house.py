@@ -94,7 +94,7 @@ def test_matplotlib_only_in_figures():
     users = {m for m in FILES if any(n.split(".")[0] == "matplotlib" for n in imported(m))}
     assert users <= {
         f"holdfast.report.{name}"
-        for name in ("figures", "mode_figures", "paper_figures", "roc_figure")
+        for name in ("figures", "mode_figures", "paper_figures", "roc_figure", "campaign_figures")
     }
 
 

@@ -27,7 +27,7 @@ def test_points_are_all_combinations_in_order(study):
     assert len(found.points) == 6
     assert found.labels_of(found.points[4]) == {"attack.value": 2.5, "detector.level": 0.1}
     content, truth = found.content_of(found.points[4])
-    assert (content["attack"][0]["value"], content["detector"]["level"], truth) == (2.5, 0.1, {})
+    assert (content["attack"][0]["value"], content["detector"]["level"], truth) == (2.5, 0.1, None)
     assert found.content["attack"][0]["value"] == 1.5  # the study's own is not touched
 
 
@@ -50,6 +50,14 @@ def test_whole_tables_lists_of_attacks_and_the_truth_alone(study):
     assert last.plant.A[1, 1] == 0.9
     assert last.monitor.estimator.plant.A[1, 1] == 0.98
     assert len(last.attacks) == 2
+
+
+def test_an_entry_of_a_matrix_and_of_the_true_one(study):
+    found = read_study(study('"plant.R[2,2]" = [0.5]\n"truth.A[2,2]" = [0.9]\n"truth.dt" = [0.1]'))
+    case = prepare(found, False).cases[0]
+    ours, truth = case.scenario.monitor.estimator.plant, case.scenario.plant
+    assert (ours.R[1, 1], truth.R[1, 1]) == (0.5, 0.5)
+    assert (ours.A[1, 1], truth.A[1, 1]) == (0.98, 0.9)
 
 
 def test_keys_come_from_what_a_point_is_and_not_from_its_place(study):
@@ -86,6 +94,7 @@ WRONG = {
     "no scenario": ("", {"scenario": '"other.toml"'}, "other.toml", "no such file"),
     "a truth of what": ('"truth" = [1]', {}, "truth.KEY", "one of [plant]"),
     "other names": ('"truth.states" = [["a", "b"]]', {}, "a true plant with other states"),
+    "outside a matrix": ('"plant.R[4,1]" = [1]', {}, "R of 3", "R[1] to R[3]"),
     "too many": (f'"attack.value" = {MANY}\n"attack.start" = {MANY}', {}, "160000", "100000"),
 }
 

@@ -1,7 +1,6 @@
 """`holdfast campaign`: a study run block by block, resumed where it was left, and reported."""
 
 import math
-import os
 import sys
 import time
 from collections.abc import Iterator
@@ -20,7 +19,7 @@ from holdfast.campaign.dataset import campaign_dataset
 from holdfast.shell import runtime
 from holdfast.shell.block_files import BlockFiles
 from holdfast.shell.errors import InputError
-from holdfast.shell.executors import Cluster, Local, Task
+from holdfast.shell.executors import Cluster, Local, Task, cores
 from holdfast.shell.points import Prepared, prepare
 from holdfast.shell.progress import progress
 from holdfast.shell.reading import size_in_words
@@ -113,9 +112,8 @@ def _tasks(prepared: Prepared, found: Found, blocks: int, per_file: int) -> Iter
 
 def _threads(prepared: Prepared, wanted: int | None) -> int:
     """Blocks at a time: as many as there are cores, as long as memory lasts."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     most = max(1, MEMORY // block_bytes(prepared))
-    return min(wanted or cores or 1, most)
+    return min(wanted or cores(), most)
 
 
 def block_bytes(prepared: Prepared) -> int:
@@ -138,9 +136,7 @@ def block_bytes(prepared: Prepared) -> int:
     return largest
 
 
-def _say(
-    prepared: Prepared, executor: Local | Cluster, blocks: int, per_file: int, kept: int
-) -> None:
+def _say(prepared: Prepared, executor: Local | Cluster, per_file: int, kept: int) -> None:
     study, steps = prepared.study, max(case.steps for case in prepared.cases)
     lines = [
         f"{_counted(len(study.points), 'point')} of {study.settings.runs} runs, {steps} steps; "

@@ -252,6 +252,23 @@ def campaign(
 
 
 @app.command()
+def tune(
+    study: Annotated[
+        str, typer.Argument(help="Study with [tune] and [settings] (TOML).", show_default=False)
+    ],
+    output: Annotated[
+        str | None,
+        typer.Option("-o", help="Folder for the settings and all that was tried."),
+    ] = None,
+    allow_python: AllowPython = False,
+) -> None:
+    """Find the settings that serve an objective best."""
+    from holdfast.shell import tuning
+
+    tuning.tune(study, output, allow_python)
+
+
+@app.command()
 def papers(
     name: Annotated[
         str | None,

@@ -82,9 +82,9 @@ def _built(
         study.scenario_path, study.scenario_source, content, allow_python, plants.get(name)
     )
     plants.setdefault(name, found.scenario.plant)
-    if not truth:
+    if truth is None:
         return found, found.scenario
-    changed = content | {"plant": content["plant"] | truth}
+    changed = content | {"plant": truth}
     name = _named(changed["plant"])
     if name not in plants:
         built = build_scenario(study.scenario_path, study.scenario_source, changed, allow_python)

@@ -23,7 +23,9 @@ TRUTH = "truth"
 """Section of an axis that changes the simulated plant alone, not the one estimators know."""
 MOST_POINTS = 100_000
 SECTIONS = tuple(name for name in ScenarioTables.model_fields if name != "run")
-_PART = re.compile(r"([\w-]+)(?:\[(\d+)\])?")
+_PART = re.compile(r"([\w-]+)(?:\[(\d+(?:, ?\d+)*)\])?")
+Dotted = list[tuple[str, tuple[int, ...]]]
+"""The parts of a dotted name, each with the numbers in its brackets."""
 
 
 class StudySettings(Strict):
@@ -38,10 +40,12 @@ class StudySettings(Strict):
 
 
 class StudyTables(Strict):
-    """The sections of a study file."""
+    """The sections of a study file; the last two are for `holdfast tune`."""
 
     study: dict[str, Any] = Field(description="a table: [study]")
     axes: dict[str, Any] = Field({}, description="a table: [axes]")
+    tune: dict[str, Any] = Field({}, description="a table: [tune]")
+    settings: dict[str, Any] = Field({}, description="a table: [settings]")
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,7 @@ class Study:
     scenario_path: str
     scenario_source: str
     content: dict[str, Any]
+    tables: StudyTables
 
     @property
     def folder(self) -> Path:
@@ -75,18 +80,22 @@ class Study:
         """Every combination, by the number of its value on each axis."""
         return list(itertools.product(*(range(len(axis.values)) for axis in self.axes)))
 
-    def content_of(self, point: tuple[int, ...]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """The scenario at a point, and what of its plant is different in truth."""
-        content, truth = copy.deepcopy(self.content), {}
-        for axis, i in zip(self.axes, point, strict=True):
-            value = copy.deepcopy(axis.values[i])
-            section, rest = _path(axis.name)[0], _path(axis.name)[1:]
-            if section[0] == TRUTH:
-                truth[rest[0][0]] = value
-            elif not rest:
-                content[section[0]] = _whole(section[0], value)
+    def content_of(self, point: tuple[int, ...]) -> tuple[dict[str, Any], dict[str, Any] | None]:
+        """The scenario at a point, and the [plant] that is simulated where that is another."""
+        content = copy.deepcopy(self.content)
+        chosen = {a.name: copy.deepcopy(a.values[i]) for a, i in zip(self.axes, point, strict=True)}
+        different = {name: value for name, value in chosen.items() if _of_truth(name)}
+        for name in chosen.keys() - different.keys():
+            (section, numbers), *rest = _path(name)
+            if rest or numbers:
+                _put(content, _path(name), chosen[name], self.path, name)
             else:
-                _put(content, _path(axis.name), value, self.path, axis.name)
+                content[section] = _whole(section, chosen[name])
+        if not different:
+            return content, None
+        truth = copy.deepcopy(content["plant"])
+        for name, value in different.items():
+            _put(truth, _path(name)[1:], value, self.path, name)
         return content, truth
 
     def name_of(self, point: tuple[int, ...]) -> str:
@@ -122,7 +131,7 @@ def study_of(path: str, source: str, scenario_path: str, scenario_source: str) -
     count = math.prod(len(axis.values) for axis in axes)
     if count > MOST_POINTS:
         raise InputError(path, "axes", f"{count} combinations", f"at most {MOST_POINTS}")
-    return Study(path, source, settings, axes, scenario_path, scenario_source, content)
+    return Study(path, source, settings, axes, scenario_path, scenario_source, content, tables)
 
 
 def _settings(path: str, source: str) -> tuple[Any, Any]:
@@ -145,7 +154,7 @@ def _axis(file: str, name: str, values: Any) -> Axis:
         section = parts[0][0] if parts else name
         expected = f"a setting such as attack.value, in {one_of(known, section)}"
         raise InputError(file, key, f"the section {section!r}", expected)
-    if parts[0][0] == TRUTH and len(parts) != 2:
+    if parts[0][0] == TRUTH and len(parts) < 2:
         raise InputError(file, key, shown(name), "truth.KEY, KEY being one of [plant]")
     if not isinstance(values, list) or not values:
         found = "an empty list" if values == [] else shown(values)
@@ -190,15 +199,19 @@ def _text(label: str | float) -> str:
     return label if isinstance(label, str) else f"{label:g}"
 
 
-def _path(name: str) -> list[tuple[str, int | None]]:
-    """The parts of a dotted name, each with the number in its brackets."""
+def _path(name: str) -> Dotted:
     found = []
     for part in name.split("."):
         matched = _PART.fullmatch(part)
         if matched is None:
             return []
-        found.append((matched[1], int(matched[2]) if matched[2] else None))
+        numbers = matched[2].split(",") if matched[2] else ()
+        found.append((matched[1], tuple(map(int, numbers))))
     return found
+
+
+def _of_truth(name: str) -> bool:
+    return _path(name)[0][0] == TRUTH
 
 
 def _whole(section: str, value: Any) -> Any:
@@ -206,24 +219,41 @@ def _whole(section: str, value: Any) -> Any:
     return [value] if section == "attack" and isinstance(value, dict) else value
 
 
-def _put(
-    content: dict[str, Any], path: list[tuple[str, int | None]], value: Any, file: str, name: str
-) -> None:
+def value_at(content: dict[str, Any], name: str) -> Any:
+    """What stands at a dotted name; None where there is nothing."""
+    place: Any = content
+    for part, numbers in _path(name):
+        place = place.get(part) if isinstance(place, dict) else None
+        for number in numbers:
+            inside = isinstance(place, list) and 1 <= number <= len(place)
+            place = place[number - 1] if inside else None
+    return place
+
+
+def _put(content: dict[str, Any], path: Dotted, value: Any, file: str, name: str) -> None:
+    """``value`` where the path leads: a key of a table, or an entry of a list or matrix there."""
     key = f'axes."{name}"'
     place: Any = content
-    for depth, (part, number) in enumerate(path):
-        if depth == len(path) - 1 and number is None:
+    for depth, (part, numbers) in enumerate(path):
+        last = depth == len(path) - 1
+        if last and not numbers:
             place[part] = value
             return
-        place = place.setdefault(part, {} if part != "attack" else [])
-        if isinstance(place, list):
-            if number is None and len(place) == 1:
-                number = 1
-            if number is None or not 1 <= number <= len(place):
+        place = place.setdefault(part, [] if part == "attack" else {})
+        if isinstance(place, list) and not numbers and len(place) == 1:
+            numbers = (1,)
+        if isinstance(place, list) and not numbers:
+            expected = f"{part}[1] to {part}[{len(place)}]" if place else f"a [[{part}]]"
+            raise InputError(file, key, f"{part} of {len(place)}", expected)
+        for i, number in enumerate(numbers):
+            if not isinstance(place, list):
+                raise InputError(file, key, f"{part}[{number}]", f"{part}, which is no list")
+            if not 1 <= number <= len(place):
                 expected = f"{part}[1] to {part}[{len(place)}]" if place else f"a [[{part}]]"
                 raise InputError(file, key, f"{part} of {len(place)}", expected)
+            if last and i == len(numbers) - 1:
+                place[number - 1] = value
+                return
             place = place[number - 1]
-        elif number is not None:
-            raise InputError(file, key, f"{part}[{number}]", f"{part}, which is no list")
         if not isinstance(place, dict):
             raise InputError(file, key, f"{part} = {shown(place)}", "a table")
