@@ -99,6 +99,7 @@ def test_a_run_alone_is_the_run_of_the_campaign(ran, study):
         assert before == alarms[:19].sum()
 
 
+@pytest.mark.filterwarnings("always:.*damaged")
 def test_workers_files_and_stops_change_nothing(ran, study, command, monkeypatch):
     whole = ran("--workers", "1")
     same(whole, ran("--workers", "2", folder="two"))

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import Bounds, differential_evolution
+from scipy.optimize import differential_evolution
 
 POPULATION = 6
 """Candidates of a generation for each setting, and at least 8 of them in all."""
@@ -92,7 +92,7 @@ def tuned(
             ask(tuple(first))
         differential_evolution(
             cost,
-            Bounds(np.zeros(len(spans)), np.ones(len(spans))),
+            [(0.0, 1.0)] * len(spans),
             popsize=max(POPULATION, -(-8 // len(spans))),
             maxiter=evaluations,
             init="sobol",
