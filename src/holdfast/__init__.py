@@ -50,6 +50,7 @@ _PUBLIC = {
     "simulate": "loop",
     "Live": "shell.live",
     "load_scenario": "shell.files",
+    "run_study": "shell.campaigning",
 }
 
 __all__ = [*_PUBLIC, "__version__"]  # pyright: ignore[reportUnsupportedDunderAll]

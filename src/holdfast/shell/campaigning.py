@@ -3,7 +3,7 @@
 import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +43,37 @@ def campaign(
 ) -> None:
     """Run a study, or go on with it; write its results, or print their summary."""
     runtime.configure()
+    try:
+        result = run_study(
+            path, output, scheduler=scheduler, workers=workers, allow_python=allow_python, told=_say
+        )
+    except KeyboardInterrupt:
+        if output is not None:
+            _say(f"interrupted: finished blocks are in {output}; the same command goes on")
+        sys.exit(INTERRUPTED)
+    if output is None:
+        _print(result)
+    else:
+        _say(str(Path(output) / "report.html"))
+
+
+def run_study(
+    path: str | Path,
+    output: str | Path | None = None,
+    *,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    allow_python: bool = False,
+    told: Callable[[str], None] = lambda line: None,
+) -> xr.Dataset:
+    """The scores of every run of a study file, and their summary.
+
+    ``output``: a folder for blocks, results and report; what it holds of the same study is
+    gone on with. ``scheduler``: the address of a Dask scheduler, else ``workers`` threads here
+    (one per core unless given). ``told`` of what is about to be run.
+
+    Raises `holdfast.shell.errors.InputError`: file, key, what was found, what was expected.
+    """
     if output is not None:
         check_place(output)
     study = read_study(path)
@@ -58,24 +89,26 @@ def campaign(
         files.begin()
     found = {} if files is None else files.read()
     try:
-        seconds, made = _run(prepared, executor, files, found)
-    except KeyboardInterrupt:
+        seconds, made = _run(prepared, executor, files, found, told)
+    finally:
         if files is not None:
             files.write_manifest()
-            print(
-                f"interrupted: the finished blocks are in {files.folder}; the same command goes on",
-                file=sys.stderr,
-            )
-        sys.exit(INTERRUPTED)
     result = _dataset(prepared, found, _attrs(study, output, seconds, made, prepared))
-    if files is None:
-        _print(result)
-    else:
+    if files is not None:
         _write(files, result)
+    return result
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr)
 
 
 def _run(
-    prepared: Prepared, executor: Local | Cluster, files: BlockFiles | None, found: Found
+    prepared: Prepared,
+    executor: Local | Cluster,
+    files: BlockFiles | None,
+    found: Found,
+    told: Callable[[str], None],
 ) -> tuple[float, int]:
     """Compute the blocks that are not there yet into ``found``; seconds, and runs made."""
     study = prepared.study
@@ -84,7 +117,8 @@ def _run(
     per_file = min(MOST_BLOCKS, math.ceil(blocks / FILES_PER_POINT))
     tasks = list(_tasks(prepared, found, blocks, per_file))
     kept = sum(len(block.scores["rows"]) for block in found.values())
-    _say(prepared, executor, per_file, kept)
+    for line in _plan(prepared, executor, per_file, kept):
+        told(line)
     start, made = time.perf_counter(), 0
     with progress("runs", runs * len(points), kept) as advance:
         for task, done in executor.run(tasks):
@@ -136,7 +170,8 @@ def block_bytes(prepared: Prepared) -> int:
     return largest
 
 
-def _say(prepared: Prepared, executor: Local | Cluster, per_file: int, kept: int) -> None:
+def _plan(prepared: Prepared, executor: Local | Cluster, per_file: int, kept: int) -> list[str]:
+    """What is about to be run, in lines."""
     study, steps = prepared.study, max(case.steps for case in prepared.cases)
     lines = [
         f"{_counted(len(study.points), 'point')} of {study.settings.runs} runs, {steps} steps; "
@@ -148,7 +183,7 @@ def _say(prepared: Prepared, executor: Local | Cluster, per_file: int, kept: int
         lines.append(
             f"going on: {kept} of {study.settings.runs * len(study.points)} runs are there"
         )
-    print("\n".join(lines), file=sys.stderr)
+    return lines
 
 
 def _counted(count: int, word: str) -> str:
@@ -156,7 +191,7 @@ def _counted(count: int, word: str) -> str:
 
 
 def _attrs(
-    study: Study, output: str | None, seconds: float, made: int, prepared: Prepared
+    study: Study, output: str | Path | None, seconds: float, made: int, prepared: Prepared
 ) -> dict[str, Any]:
     steps = max(case.steps for case in prepared.cases)
     return {
@@ -197,7 +232,6 @@ def _write(files: BlockFiles, result: xr.Dataset) -> None:
     write_figures(files.folder, figures(result))
     write_text(files.folder / "report.html", page(result))
     files.write_manifest()
-    print(f"{files.folder / 'report.html'}", file=sys.stderr)
 
 
 def _summary_table(result: xr.Dataset) -> Any:
