@@ -34,6 +34,7 @@ from holdfast.estimators import (
     care,
     decomposition,
     extended,
+    huber,
     kalman,
     l1_decoder,
     l1_kalman,
@@ -74,6 +75,7 @@ PLANTS: Builders = {
 
 ESTIMATORS: Builders = {
     "kalman": kalman.build,
+    "huber": huber.build,
     "unknown_input": unknown_input.build,
     "care": care.build,
     "extended": extended.build,

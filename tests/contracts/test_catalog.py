@@ -55,6 +55,7 @@ X0, P0 = np.array([0.3, -0.2]), np.array([[2.0, 0.3], [0.3, 1.0]])
 # What each kind is given beyond its defaults. A new entry of the catalog needs a line here.
 ESTIMATOR_SETTINGS = {
     "kalman": {},
+    "huber": {},
     "unknown_input": {},
     "care": {},
     "extended": {},
