@@ -97,6 +97,7 @@ def test_bins_hold_the_margins(run):
     assert attacked.sum() == np.sum(tested[rows[0] : rows[-1] + 1] if len(rows) else 0)
 
 
+@pytest.mark.slow
 def test_localisation_counts_channels(tmp_path):
     path = tmp_path / "scenario.toml"
     detector = '[detector]\nkind = "per_channel"\non = "residual"'

@@ -390,6 +390,7 @@ def test_ambiguous():
 SHOUTED = {"A": [[1.0]], "C": [[100.0], [1.0], [1.0]], "Q": [[1e-6]], "R": np.eye(3) * 1e-4}
 
 
+@pytest.mark.slow
 def test_the_condition_for_l0_does_not_guarantee_l1():
     """Errata 1: C = (100, 1, 1)', x = 1, sensor 1 attacked by -100 in every row: l0 is certain
     to correct one sensor, and gives 1; l1 gives 0."""
@@ -427,6 +428,7 @@ threshold = "paper"
 """
 
 
+@pytest.mark.slow
 def test_the_same_on_the_command_line(tmp_path, monkeypatch, capsys):
     """`holdfast replay` on the written log: x empty until the window is full, then 0, or 1."""
     log_file = tmp_path / "log.csv"

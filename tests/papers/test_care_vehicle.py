@@ -12,6 +12,8 @@ from holdfast.papers import care_table as table
 from holdfast.papers import care_vehicle as vehicle
 from papers import care_oracle as oracle
 
+pytestmark = pytest.mark.slow  # sixteen seeds of the case study
+
 SEED = 3
 SEEDS_OF_ERRATA = 16
 
