@@ -280,3 +280,42 @@ def test_a_worker_that_is_killed_is_made_up_for(ran, study, monkeypatch):
             found = ran("--scheduler", cluster.scheduler_address)
     assert killed
     same(found, ran(folder="here"))
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_dies_keeps_what_is_finished(ran, study, command, monkeypatch):
+    pytest.importorskip("distributed")
+    study.write_text(study_text(AXES, runs=100_000, steps=30))
+    python = [sys.executable, "-m"]
+    port = 18_786 + os.getpid() % 1000
+    address = f"tcp://127.0.0.1:{port}"
+    scheduler = subprocess.Popen(
+        [*python, "distributed.cli.dask_scheduler", "--port", str(port), "--no-dashboard"],
+        stderr=subprocess.DEVNULL,
+    )
+    worker = subprocess.Popen(
+        [*python, "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard"],
+        stderr=subprocess.DEVNULL,
+    )
+    write, count = block_files.BlockFiles.write, 0
+
+    def killing(self, *args):
+        nonlocal count
+        write(self, *args)
+        count += 1
+        if count == 3:
+            scheduler.kill()
+
+    try:
+        monkeypatch.setattr(block_files.BlockFiles, "write", killing)
+        time.sleep(5)
+        code, out, err = command(
+            "campaign", study, "-o", study.parent / "out", "--scheduler", address
+        )
+    finally:
+        for process in (worker, scheduler):
+            process.kill()
+            process.wait()
+    assert (code, out) == (2, "")
+    assert "a scheduler that went away" in err
+    assert len(finished(study.parent / "out")) >= 3

@@ -93,6 +93,7 @@ WRONG = {
     "an unknown setting": ("", {"rusn": 5}, "study.rusn", "did you mean 'runs'"),
     "no scenario": ("", {"scenario": '"other.toml"'}, "other.toml", "no such file"),
     "a truth of what": ('"truth" = [1]', {}, "truth.KEY", "one of [plant]"),
+    "a true start": ('"truth.x0" = [[1, 1]]', {}, "truth.x0", "plant.x0"),
     "other names": ('"truth.states" = [["a", "b"]]', {}, "a true plant with other states"),
     "outside a matrix": ('"plant.R[4,1]" = [1]', {}, "R of 3", "R[1] to R[3]"),
     "too many": (f'"attack.value" = {MANY}\n"attack.start" = {MANY}', {}, "160000", "100000"),

@@ -101,22 +101,29 @@ class Cluster:
 
     def run(self, tasks: Iterable[Task]) -> Iterator[tuple[Task, list[Block]]]:
         """Each task with its blocks as it is finished; what a dead worker had goes to another."""
-        client = self.client
-        text = client.scatter(self._payload, broadcast=True, hash=True)
+        client, dask = self.client, self._distributed
+        # the text goes with every task: what is scattered dies with the workers that hold it
         futures = {
-            client.submit(on_worker, text, tuple(task), pure=False, retries=RETRIES): task
+            client.submit(on_worker, self._payload, tuple(task), pure=False, retries=RETRIES): task
             for task in tasks
         }
         try:
-            for future, found in self._distributed.as_completed(futures, with_results=True):
+            for future, found in dask.as_completed(futures, with_results=True):
+                if isinstance(found, BaseException):  # what was cancelled comes as a result
+                    raise found
                 yield futures[future], found
-        except self._distributed.client.FutureCancelledError:
+        except (dask.CancelledError, dask.client.FutureCancelledError, OSError):
             raise InputError("--scheduler", "", "a scheduler that went away",
                              "one that stays; finished blocks are kept") from None  # fmt: skip
+        except dask.KilledWorker:
+            raise InputError(
+                "--scheduler", "", f"a block that {RETRIES + 1} workers died with",
+                "workers with more memory; finished blocks are kept",
+            ) from None  # fmt: skip
         finally:
             with contextlib.suppress(Exception):
                 client.cancel(list(futures))
-                client.close()
+                client.close(timeout=TIMEOUT_S)
 
 
 def _packed(prepared: Prepared, allow_python: bool) -> str:

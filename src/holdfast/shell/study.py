@@ -156,6 +156,8 @@ def _axis(file: str, name: str, values: Any) -> Axis:
         raise InputError(file, key, f"the section {section!r}", expected)
     if parts[0][0] == TRUTH and len(parts) < 2:
         raise InputError(file, key, shown(name), "truth.KEY, KEY being one of [plant]")
+    if parts[0][0] == TRUTH and parts[1][0] == "x0":
+        raise InputError(file, key, shown(name), "plant.x0, which is the true start already")
     if not isinstance(values, list) or not values:
         found = "an empty list" if values == [] else shown(values)
         raise InputError(file, key, found, "a list of the values to try")
