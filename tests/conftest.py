@@ -6,6 +6,7 @@ import os
 import shutil
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"
@@ -57,12 +58,27 @@ def pytest_configure(config):
 MAPPINGS = 30_000
 """Memory mappings from which on a worker forgets its programs: each holds some, the kernel allows
 65 530, and a compiler that gets no more ends the process."""
+LONG = 2.0
+"""Seconds from which on a test may have compiled thousands of mappings' worth."""
+
+
+@pytest.fixture(autouse=True)
+def room_for_programs():
+    """Keeps the mappings of compiled programs under what the kernel allows."""
+    start = time.monotonic()
+    yield
+    if time.monotonic() - start > LONG:
+        forget_programs()
 
 
 @pytest.fixture(scope="module", autouse=True)
-def room_for_programs():
-    """Keeps the mappings of compiled programs under what the kernel allows."""
+def room_after_a_module():
+    """The same, after many short tests."""
     yield
+    forget_programs()
+
+
+def forget_programs():
     held = Path("/proc/self/maps")
     if held.exists() and held.read_bytes().count(b"\n") > MAPPINGS:
         jax.clear_caches()
