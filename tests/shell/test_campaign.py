@@ -254,7 +254,7 @@ def finished(folder):
 def test_a_cluster_gives_the_same(ran, study, workers):
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
-        n_workers=workers, threads_per_worker=1, dashboard_address=None
+        n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0"
     ) as cluster:
         same(ran(folder="here"), ran("--scheduler", cluster.scheduler_address))
 
@@ -265,7 +265,7 @@ def test_a_worker_that_is_killed_is_made_up_for(ran, study, monkeypatch):
     study.write_text(study_text(AXES, runs=20_000, steps=30))
     write, killed = block_files.BlockFiles.write, []
     with distributed.LocalCluster(
-        n_workers=3, threads_per_worker=1, dashboard_address=None
+        n_workers=3, threads_per_worker=1, dashboard_address="127.0.0.1:0"
     ) as cluster:
 
         def killing(self, *args):
