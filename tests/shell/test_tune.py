@@ -98,6 +98,7 @@ WRONG = {
         "the lowest and the highest",
     ),
     "an order": ("[1.0, 10000.0]", "[2.0, 1.0]", "the lower one first"),
+    "a name": ('"plant.R[1,1]" = [1', '"plant R" = [1', 'settings."plant R"'),
     "no settings": ('"plant.R[1,1]" = [1.0, 10000.0]', "", "settings: found nothing"),
     "a key": ("evaluations = 40", "evaluation = 40", "did you mean 'evaluations'"),
 }

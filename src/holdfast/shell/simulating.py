@@ -1,7 +1,6 @@
 """Many runs of a scenario, in blocks, with a progress bar where somebody watches."""
 
 import math
-import sys
 from typing import Any
 
 import equinox as eqx
@@ -12,6 +11,7 @@ import numpy as np
 from holdfast.loop import Scenario, simulate
 from holdfast.records import Trace
 from holdfast.shell.errors import InputError
+from holdfast.shell.progress import progress
 from holdfast.shell.reading import size_in_words
 
 MOST_BYTES = 8 * 2**30
@@ -37,7 +37,7 @@ def simulated(
         return jax.tree.map(np.asarray, trace), time
     block = max(1, min(runs, BLOCK_ROWS // steps))
     parts = []
-    with _progress(runs) as advance:
+    with progress("runs", runs) as advance:
         for start in range(0, runs, block):
             numbers = jnp.arange(start, min(start + block, runs))
             keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(numbers)
@@ -63,35 +63,3 @@ def _check_size(scenario: Scenario, steps: int, runs: int, file: str) -> None:
             f"{runs} runs of {steps} steps, {size_in_words(row * steps * runs)} of records",
             f"fewer runs or steps: at most {size_in_words(MOST_BYTES)}",
         )
-
-
-class _Silent:
-    """No progress bar: nobody is looking."""
-
-    def __enter__(self):
-        return lambda count: None
-
-    def __exit__(self, *problem):
-        return None
-
-
-class _Bar:
-    """A progress bar on standard error."""
-
-    def __init__(self, runs: int):
-        from rich.console import Console
-        from rich.progress import Progress
-
-        self._progress = Progress(console=Console(stderr=True), transient=True)
-        self._task = self._progress.add_task("runs", total=runs)
-
-    def __enter__(self):
-        self._progress.start()
-        return lambda count: self._progress.advance(self._task, count)
-
-    def __exit__(self, *problem):
-        self._progress.stop()
-
-
-def _progress(runs: int) -> _Bar | _Silent:
-    return _Bar(runs) if sys.stderr.isatty() else _Silent()

@@ -146,8 +146,8 @@ def _settings(path: str, source: str) -> tuple[Any, Any]:
     return Table(path, "study", tables.study, folder).checked(StudySettings), tables
 
 
-def _axis(file: str, name: str, values: Any) -> Axis:
-    key = f'axes."{name}"'
+def check_name(file: str, key: str, name: str) -> None:
+    """Whether a dotted name can be a setting of a scenario. Raises `InputError` about ``key``."""
     parts = _path(name)
     known = (*SECTIONS, TRUTH)
     if not parts or parts[0][0] not in known:
@@ -158,6 +158,11 @@ def _axis(file: str, name: str, values: Any) -> Axis:
         raise InputError(file, key, shown(name), "truth.KEY, KEY being one of [plant]")
     if parts[0][0] == TRUTH and parts[1][0] == "x0":
         raise InputError(file, key, shown(name), "plant.x0, which is the true start already")
+
+
+def _axis(file: str, name: str, values: Any) -> Axis:
+    key = f'axes."{name}"'
+    check_name(file, key, name)
     if not isinstance(values, list) or not values:
         found = "an empty list" if values == [] else shown(values)
         raise InputError(file, key, found, "a list of the values to try")

@@ -21,7 +21,7 @@ from holdfast.shell.executors import Local, Task, cores
 from holdfast.shell.points import Prepared, prepare
 from holdfast.shell.progress import progress
 from holdfast.shell.schema import Strict, Table
-from holdfast.shell.study import Axis, Study, read_study, value_at
+from holdfast.shell.study import Axis, Study, check_name, read_study, value_at
 from holdfast.shell.writing import check_place, unwritable, write_text
 
 BENIGN = "none"
@@ -57,13 +57,13 @@ def tune(path: str, output: str | None, allow_python: bool) -> None:
         check_place(output)
     plan = _read(path)
     start = prepare(plan.study, allow_python)
-    reference = _Scores(start, "the study as it is")
+    reference = _Scores(start)
     loss = _reference(plan, reference)
     current = _current(plan)
 
     def judge(settings: tuple[float | int, ...]) -> Judged:
         prepared = prepare(_with(plan, settings), allow_python)
-        return _judged(plan, _Scores(prepared, shown(settings)), loss)
+        return _judged(plan, _Scores(prepared), loss)
 
     with progress("settings tried", plan.settings.evaluations) as advance:
         trials = tuned(
@@ -89,6 +89,7 @@ def _read(path: str) -> Plan:
 
 def _span(file: str, name: str, value: Any) -> Span:
     key = f'settings."{name}"'
+    check_name(file, key, name)
     pair = isinstance(value, list) and len(value) == 2
     if not pair or any(isinstance(v, bool) or not isinstance(v, int | float) for v in value):
         raise InputError(file, key, shown(value), "the lowest and the highest value: [0.1, 60]")
@@ -119,8 +120,8 @@ def _current(plan: Plan) -> tuple[float | int, ...] | None:
 class _Scores:
     """Means of every score at every point."""
 
-    def __init__(self, prepared: Prepared, what: str):
-        self.what, self.study = what, prepared.study
+    def __init__(self, prepared: Prepared):
+        self.study = prepared.study
         runs = prepared.study.settings.runs
         blocks = math.ceil(runs / BLOCK)
         tasks = [Task(i, 0, blocks) for i in range(len(prepared.cases))]
