@@ -1,17 +1,15 @@
 """The page of a campaign: what was run, the figures, and every point with its scores."""
 
 import itertools
-from importlib import resources
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from holdfast import __version__
 from holdfast.report import campaign_figures, sections
 from holdfast.report.campaign_grid import labels, means, score_label, study_axes
 from holdfast.report.figures import NARROW, WIDE, svg
-from holdfast.report.markup import Column, Markup, element, items, join, section, table
+from holdfast.report.markup import Column, Markup, document, element, items, join, section, table
 from holdfast.report.pictures import Picture
 from holdfast.report.words import DASH, NBSP, count, number
 
@@ -55,21 +53,11 @@ def page(found: xr.Dataset) -> str:
         section("points", "All points", _points(found)),
     ]  # fmt: skip
     kept = [part for part in parts if part]
-    style = resources.files("holdfast.report").joinpath("style.css").read_text("utf-8")
-    head = join([
-        Markup('<meta charset="utf-8">'),
-        Markup('<meta name="viewport" content="width=device-width, initial-scale=1">'),
-        element("title", title),
-        element("style", Markup(style)),
-    ])  # fmt: skip
     top = element(
         "header", element("h1", title), element("p", _subtitle(found), class_="under"),
         sections.contents(kept),
     )  # fmt: skip
-    foot = element("footer", element("p", f"Written by holdfast {__version__}."))
-    return f'<!DOCTYPE html>\n<html lang="en">\n<head>\n{head}\n</head>\n<body>\n' + (
-        f"{top}\n{element('main', *kept)}\n{foot}\n</body>\n</html>\n"
-    )
+    return document(title, top, kept)
 
 
 def _subtitle(found: xr.Dataset) -> str:

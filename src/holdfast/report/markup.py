@@ -2,8 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 from html import escape
+from importlib import resources
 from typing import Any, NamedTuple
 
+from holdfast import __version__
 from holdfast.report.words import DASH, MINUS
 
 
@@ -99,3 +101,19 @@ def _cell(value: Any) -> str:
     if isinstance(value, list | tuple):
         return ", ".join(_cell(v) for v in value)
     return str(value)
+
+
+def document(title: str, top: Markup, parts: Sequence[Markup]) -> str:
+    """A whole page in one file: its style, the header ``top``, and its parts."""
+    style = resources.files("holdfast.report").joinpath("style.css").read_text("utf-8")
+    head = join([
+        Markup('<meta charset="utf-8">'),
+        Markup('<meta name="viewport" content="width=device-width, initial-scale=1">'),
+        element("title", title),
+        element("style", Markup(style)),
+    ])  # fmt: skip
+    body = element("main", *parts)
+    foot = element("footer", element("p", f"Written by holdfast {__version__}."))
+    return f'<!DOCTYPE html>\n<html lang="en">\n<head>\n{head}\n</head>\n<body>\n' + (
+        f"{top}\n{body}\n{foot}\n</body>\n</html>\n"
+    )

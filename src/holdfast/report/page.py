@@ -7,7 +7,7 @@ import platform
 import secrets
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
-from importlib import metadata, resources
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from holdfast import __version__
 from holdfast.records import Trace
 from holdfast.report import sections
-from holdfast.report.markup import Markup, element, items, join, section, settings
+from holdfast.report.markup import Markup, document, element, items, section, settings
 from holdfast.report.pictures import Picture, draw
 from holdfast.report.tables import dataset, json_safe
 from holdfast.report.truth import Modes, Named
@@ -113,23 +113,12 @@ def render(
         section("scenario", "Scenario", element("pre", scenario_text, tabindex="0")),
         section("versions", "Versions and files", settings(versions()), sections.files(FILES)),
     ]  # fmt: skip
-    style = resources.files("holdfast.report").joinpath("style.css").read_text("utf-8")
-    head = join([
-        Markup('<meta charset="utf-8">'),
-        Markup('<meta name="viewport" content="width=device-width, initial-scale=1">'),
-        element("title", title),
-        element("style", Markup(style)),
-    ])  # fmt: skip
     top = element(
         "header", element("h1", title), element("p", _subtitle(summary), class_="under"),
         sections.verdict_card(summary, units), sections.key_numbers(summary),
         sections.contents([part for part in parts if part]),
     )  # fmt: skip
-    body = element("main", *(part for part in parts if part))
-    foot = element("footer", element("p", f"Written by holdfast {__version__}."))
-    return f'<!DOCTYPE html>\n<html lang="en">\n<head>\n{head}\n</head>\n<body>\n' + (
-        f"{top}\n{body}\n{foot}\n</body>\n</html>\n"
-    )
+    return document(title, top, [part for part in parts if part])
 
 
 def versions() -> dict[str, str]:
