@@ -52,6 +52,7 @@ from holdfast.plants.library import (
     gps_imu,
     quadrotor,
     swing,
+    tanks,
     uav,
     unicycle,
     vehicle_tracking,
@@ -71,6 +72,7 @@ PLANTS: Builders = {
     "unicycle": unicycle.build,
     "swing": swing.network,
     "swing68": swing.build,
+    "tanks": tanks.build,
 }
 
 ESTIMATORS: Builders = {

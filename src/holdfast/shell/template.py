@@ -88,10 +88,11 @@ EXAMPLES: dict[str, dict[str, Any]] = {
         },
         "x0": [0.3, -0.4, 0.1, 0.0, 0.0, 0.0],
     },
+    "tanks": {"plant": {"attacks": ["actuator:pump:1"]}, "x0": [1.4, 1.27, 1.61, 1.44]},
     "unicycle": {"plant": {"landmarks": [[4.0, 1.0], [1.0, 5.0], [-3.0, 2.0], [2.0, -4.0]]}},
 }
 """What suits a plant better than zeros: where it starts (power flows only between different
-angles), and what to attack."""
+angles, water only out of tanks that are not empty), and what to attack."""
 
 NOTES = {
     "x0": "estimate one sample before the first row",

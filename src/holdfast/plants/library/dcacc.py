@@ -7,12 +7,14 @@ import numpy as np
 from holdfast.parts import InvalidValue
 from holdfast.plants.build import linear_plant
 from holdfast.plants.linear import LinearPlant
+from holdfast.plants.named import channels
 
 TAU = 0.8
 """The paper's maneuver time constant, s."""
 MANEUVER = 1.0
 LIDAR = (0.01, 0.01)
 """Variances chosen here: (m/s^2)^2; m^2, (m/s)^2."""
+INPUTS, OUTPUTS = ("command",), ("measured_distance", "measured_speed")
 
 
 def build(
@@ -21,6 +23,7 @@ def build(
     tau: float = TAU,
     process_noise: float = MANEUVER,
     sensor_noise: Sequence[float] = LIDAR,
+    attacks: Sequence[str] = (),
 ) -> LinearPlant:
     """Degraded cooperative adaptive cruise control, with the Singer model of (63), (64):
 
@@ -36,9 +39,11 @@ def build(
     of distance and speed (0.01 m^2 and 0.01 (m/s)^2: 10 cm and 10 cm/s).
 
     states "distance", "speed", "acceleration", input "command", outputs "measured_distance",
-    "measured_speed"; no attack channel besides those of the sensors and the actuator.
+    "measured_speed". ``attacks``: the attack channels, of "actuator:command",
+    "sensor:measured_distance", "sensor:measured_speed" (`holdfast.plants.named`), held over a
+    sample like u.
 
-    Raises `InvalidValue` for a time or a variance that cannot be.
+    Raises `InvalidValue` for a time, a variance or an attack that cannot be.
 
     Source: INTEGRITY, Section VI-B, errata 11; Singer, Estimating optimal tracking filter
     performance for manned maneuvering targets (1970).
@@ -49,16 +54,21 @@ def build(
         raise InvalidValue("process_noise", process_noise, "a variance, 0 or more")
     if len(sensor_noise) != 2 or not all(np.isfinite(r) and r > 0 for r in sensor_noise):
         raise InvalidValue("sensor_noise", list(sensor_noise), "two variances above 0")
+    act, sens = channels(attacks, INPUTS, OUTPUTS)
+    push = np.array([[0.0], [0.0], [1.0]])
     return linear_plant(
         time="continuous",
         noise="white",
         dt=dt,
         A=[[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0 / tau]],
-        B=[[0.0], [0.0], [1.0]],
+        B=push,
         C=[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]],
+        G=push @ act,
+        H=sens,
         Q=np.diag([0.0, 0.0, 2.0 * process_noise / tau]),
         R=np.diag(sensor_noise),
         states=["distance", "speed", "acceleration"],
-        inputs=["command"],
-        outputs=["measured_distance", "measured_speed"],
+        inputs=INPUTS,
+        outputs=OUTPUTS,
+        attacks=attacks,
     )

@@ -1,10 +1,13 @@
 """A quadrotor near hover: two tilting axes and a vertical one, whichever states are measured."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from holdfast.parts import InvalidValue
 from holdfast.plants.build import linear_plant
 from holdfast.plants.linear import LinearPlant
+from holdfast.plants.named import channels
 
 STATES = (
     "p_x", "v_x", "theta_x", "theta_x_rate",
@@ -36,6 +39,7 @@ def build(
     rate_sd: float = 0.05,
     acceleration_noise: float = 0.1,
     tilt_noise: float = 0.1,
+    attacks: Sequence[str] = (),
 ) -> LinearPlant:
     """The ten-state model of the DECODER paper. For both horizontal axes, and the vertical one,
 
@@ -54,11 +58,13 @@ def build(
     (m/s), ``angle_sd`` (rad), ``rate_sd`` (rad/s). The paper states no noise: the defaults are
     those of a good receiver and a small inertial unit in light wind.
 
-    states (10), inputs (3), outputs named like the states; no attack channel besides those of
-    the sensors. A position is seen by position sensors alone, however many others there are.
+    states (10), inputs (3), outputs named like the states. A position is seen by position
+    sensors alone, however many others there are. ``attacks``: the attack channels,
+    "actuator:thrust", "sensor:p_x", "sensor:p_x_2", .. (`holdfast.plants.named`), held over a
+    sample like the inputs.
 
-    Raises `InvalidValue` for a count of sensors other than 3, 5, 8, an unknown state, a
-    deviation that is not positive or a density that is negative.
+    Raises `InvalidValue` for a count of sensors other than 3, 5, 8, an unknown state or attack,
+    a deviation that is not positive or a density that is negative.
 
     Source: DECODER, Section V-A; the model and its numbers: P. Bouffard, On-board Model
     Predictive Control of a Quadrotor Helicopter, UCB/EECS-2012-241.
@@ -69,6 +75,8 @@ def build(
     densities = {"acceleration_noise": acceleration_noise, "tilt_noise": tilt_noise}
     _check(deviations, densities)
     measured = _measured(sensors)
+    outputs = _numbered(measured)
+    act, sens = channels(attacks, INPUTS, outputs)
     A, B, Q = np.zeros((10, 10)), np.zeros((10, 3)), np.zeros(10)
     for axis, first in enumerate((0, 4)):
         p, v, theta, rate = range(first, first + 4)
@@ -84,11 +92,14 @@ def build(
         A=A,
         B=B,
         C=np.eye(10)[[STATES.index(name) for name in measured]],
+        G=B @ act,
+        H=sens,
         Q=np.diag(Q),
         R=np.diag([deviations[_kind(name)] ** 2 for name in measured]),
         states=STATES,
         inputs=INPUTS,
-        outputs=_numbered(measured),
+        outputs=outputs,
+        attacks=attacks,
     )
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from holdfast.parts import InvalidValue
 from holdfast.plants.library.swing_network import MEASURED, SwingNetwork
+from holdfast.plants.named import channels
 
 ATTACKS = (
     "sensor:P_elec:26", "sensor:P_elec:53", "sensor:P_elec:54",
@@ -113,7 +114,8 @@ def network(
     places = np.array([[place[bus] for bus in pair] for pair in ends], np.int32).T
     positions, closed = _positions(switches, ends)
     outputs = [f"{kind}:{bus}" for bus in buses for kind in MEASURED]
-    actuators, sensors = _channels(attacks, buses, outputs)
+    written = "'actuator:BUS' or 'sensor:P_elec|theta|f:BUS'"
+    actuators, sensors = channels(attacks, [str(bus) for bus in buses], outputs, expected=written)
     arrays = {
         "ends": places,
         "incidence": np.eye(n)[:, places[0]] - np.eye(n)[:, places[1]],
@@ -198,20 +200,3 @@ def _positions(
             gone = [known[line] for line in opened]
             closed.append([float(set(pair) not in gone) for pair in ends])
     return tuple(names), np.array(closed)
-
-
-def _channels(
-    attacks: Sequence[str], buses: list[int], outputs: list[str]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Which input, and which output, each attack channel adds to."""
-    if len(set(attacks)) != len(attacks):
-        raise InvalidValue("attacks", list(attacks), "names that differ")
-    inputs = [f"actuator:{bus}" for bus in buses]
-    names = [*inputs, *(f"sensor:{name}" for name in outputs)]
-    for i, attack in enumerate(attacks, 1):
-        if attack not in names:
-            raise InvalidValue(
-                f"attacks[{i}]", repr(attack), "'actuator:BUS' or 'sensor:P_elec|theta|f:BUS'"
-            )
-    chosen = np.eye(len(names))[:, [names.index(attack) for attack in attacks]]
-    return chosen[: len(inputs)], chosen[len(inputs) :]

@@ -1,10 +1,13 @@
 """A vehicle that follows a trajectory, its position and its speed measured, per axis."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from holdfast.parts import InvalidValue
 from holdfast.plants.build import linear_plant
 from holdfast.plants.linear import LinearPlant
+from holdfast.plants.named import channels
 
 DT = 0.01
 A = ((1.0, DT), (0.0, 1.0))
@@ -13,7 +16,11 @@ PROCESS, SENSORS = 0.26984, 10.144
 
 
 def build(
-    *, axes: int = 1, process_noise: float = PROCESS, sensor_noise: float = SENSORS
+    *,
+    axes: int = 1,
+    process_noise: float = PROCESS,
+    sensor_noise: float = SENSORS,
+    attacks: Sequence[str] = (),
 ) -> LinearPlant:
     """Per axis the discrete model of (62), dt = 0.01 s:
 
@@ -28,10 +35,12 @@ def build(
 
     ``axes`` 1: states "position" (m), "speed" (m/s), input "accel" (m/s^2), outputs
     "measured_position", "measured_speed". ``axes`` 2: states x, x_speed, y, y_speed, inputs
-    x_accel, y_accel, outputs measured_x, ..; the axes do not act on each other. No attack
-    channel besides those of the sensors and actuators.
+    x_accel, y_accel, outputs measured_x, ..; the axes do not act on each other.
+    ``attacks``: the attack channels, "actuator:accel", "sensor:measured_speed", ..
+    (`holdfast.plants.named`).
 
-    Raises `InvalidValue` for another number of axes or variances that cannot be.
+    Raises `InvalidValue` for another number of axes, variances that cannot be or attacks that
+    have no such name.
 
     Source: INTEGRITY, Section VI-A, errata 11.
     """
@@ -43,14 +52,21 @@ def build(
         raise InvalidValue("sensor_noise", sensor_noise, "a variance above 0")
     each, n = np.eye(axes), 2 * axes
     states = ["position", "speed"] if axes == 1 else ["x", "x_speed", "y", "y_speed"]
+    inputs = ["accel"] if axes == 1 else ["x_accel", "y_accel"]
+    outputs = [f"measured_{name}" for name in states]
+    act, sens = channels(attacks, inputs, outputs)
+    push = np.kron(each, B)
     return linear_plant(
         A=np.kron(each, A),
-        B=np.kron(each, B),
+        B=push,
         C=np.eye(n),
+        G=push @ act,
+        H=sens,
         Q=process_noise * np.eye(n),
         R=sensor_noise * np.eye(n),
         dt=DT,
         states=states,
-        inputs=["accel"] if axes == 1 else ["x_accel", "y_accel"],
-        outputs=[f"measured_{name}" for name in states],
+        inputs=inputs,
+        outputs=outputs,
+        attacks=attacks,
     )
