@@ -1,5 +1,8 @@
 """A car whose sensors and actuator may lie, as scenario and study texts for tests."""
 
+import re
+from pathlib import Path
+
 PLANT = """\
 [plant]
 kind = "linear"
@@ -19,6 +22,13 @@ attacks = ["gps_spoof", "accel_attack"]
 KALMAN = 'kind = "kalman"'
 DETECTOR = '[detector]\nkind = "chi_square"\nlevel = 0.05'
 SPOOF = '[[attack]]\nkind = "bias"\nchannel = "channel:gps_spoof"\nstart = 2\nvalue = 1.5'
+
+
+def documented(word: str) -> str:
+    """The one Python example in docs/campaigns.md that has this word."""
+    text = (Path(__file__).parents[1] / "docs" / "campaigns.md").read_text()
+    (found,) = [code for code in re.findall(r"```python\n(.*?)```", text, re.S) if word in code]
+    return found
 
 
 def scenario_text(estimator: str = KALMAN, attack: str = SPOOF, detector: str = DETECTOR) -> str:

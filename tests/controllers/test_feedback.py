@@ -6,6 +6,7 @@ import scipy.linalg
 from holdfast.controllers.feedback import build
 from holdfast.parts import InvalidValue
 from holdfast.plants.build import linear_plant
+from holdfast.plants.library import tanks
 from holdfast.records import Estimate
 
 
@@ -99,3 +100,40 @@ def test_wrong_settings_are_named(A, B, keys, message):
 def test_a_stable_mode_need_not_be_reached():
     controller = build(plant_of([[1.1, 0], [0, 0.5]], [[1], [0]]), **GOOD)
     assert np.all(np.isfinite(controller.gain))
+
+
+def test_holds_the_operating_point_of_a_nonlinear_plant():
+    """Tanks: linearised where they stand, against the differences of the plant itself."""
+    plant = tanks.build()
+    flows = [0.022, 0.015]
+    levels = tanks.operating_point(flows)
+    controller = build(
+        plant, state_weight=np.eye(4).tolist(), input_weight=(1e3 * np.eye(2)).tolist(),
+        reference=levels.tolist(), command=flows,
+    )  # fmt: skip
+    step, none = jnp.asarray(1, jnp.int32), jnp.zeros(0)
+
+    def moved(x, u):
+        return np.asarray(plant.transition(step, jnp.asarray(x), jnp.asarray(u), none))
+
+    h = 1e-5
+    A = np.stack([(moved(levels + h * e, flows) - moved(levels - h * e, flows)) / (2 * h)
+                  for e in np.eye(4)], 1)  # fmt: skip
+    B = np.stack([(moved(levels, flows + h * e) - moved(levels, flows - h * e)) / (2 * h)
+                  for e in np.eye(2)], 1)  # fmt: skip
+    S = scipy.linalg.solve_discrete_are(A, B, np.eye(4), 1e3 * np.eye(2))
+    K = np.linalg.solve(1e3 * np.eye(2) + B.T @ S @ B, B.T @ S @ A)
+    # central differences of 1e-5 are good to 1e-9
+    assert np.asarray(controller.gain) == pytest.approx(K, rel=1e-6, abs=1e-9)
+
+    x = levels + 0.1
+    for _ in range(2000):
+        x = moved(x, np.asarray(controller.command(estimate_of(x))))
+    assert x == pytest.approx(levels, abs=1e-9)
+    assert np.asarray(controller.command(estimate_of(x))) == pytest.approx(flows, abs=1e-9)
+
+
+def test_a_command_of_wrong_length_is_named():
+    with pytest.raises(InvalidValue, match="one per input"):
+        build(tanks.build(), state_weight=np.eye(4).tolist(), input_weight=np.eye(2).tolist(),
+              command=[0.0])  # fmt: skip

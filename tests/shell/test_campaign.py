@@ -20,7 +20,7 @@ from holdfast.report import campaign_figures, campaign_page
 from holdfast.shell import block_files, campaigning, executors, writing
 from holdfast.shell.points import prepare
 from holdfast.shell.study import read_study
-from studied import scenario_text, study_text
+from studied import KALMAN, documented, scenario_text, study_text
 
 AXES = '"attack.value" = [0.5, 2.0]'
 SEEN = "state_rmse", "detection_delay", "false_alarms", "missed", "nees"
@@ -132,6 +132,40 @@ def test_more_runs_and_more_values_go_on(ran, study):
     np.testing.assert_array_equal(
         fewer.state_rmse.values, first.state_rmse.isel(run=slice(0, 300)).values
     )
+
+
+LQR = """
+[controller]
+kind = "lqr"
+state_weight = [[1.0, 0.0], [0.0, 1.0]]
+input_weight = [[1.0]]
+"""
+
+
+def test_the_control_cost_lost_is_that_of_pairs_of_runs(ran, study, monkeypatch):
+    """As the documentation computes it: run by run, the same noise with the attack and without."""
+    (study.parent / "scenario.toml").write_text(scenario_text(KALMAN, LQR))
+    pushed = '{ kind = "bias", channel = "actuator:accel", start = 1, value = 0.02 }'
+    study.write_text(study_text(f'"attack" = [[], {pushed}]', runs=40, common_noise="true"))
+    ran()
+    monkeypatch.chdir(study.parent)
+    names = {"xarray": xr}
+    exec(documented("control_cost"), names)
+    cost, lost = names["cost"], names["lost"]
+    assert cost.dims == ("attack", "run")
+    assert lost.dims == ("run",)
+    prepared = prepare(read_study(study), False)
+    for run in (0, 39):
+        one, two = (single(c, prepared.keys[0], run) for c in prepared.cases)
+        without, under = (
+            float(np.mean(np.sum(np.square(t.x), 1) + np.square(t.observation.u[:, 0])))
+            for t in (one, two)
+        )
+        np.testing.assert_allclose(lost.isel(run=run), under - without, rtol=1e-9)
+    # of a weak attack the difference of a pair varies far less than the costs do
+    assert lost.std() < 0.3 * cost.sel(attack="none").std()
+    mean = result_of(study.parent / "out").summary.sel(score="control_cost", statistic="mean")
+    np.testing.assert_allclose(mean, cost.mean("run"), rtol=1e-12)
 
 
 def test_the_summary_without_a_folder(study, command):

@@ -11,6 +11,7 @@
 | localisation_precision | channels hit | channels named in attacked rows |
 | localisation_recall | channels named | channels hit in attacked rows |
 | mode_accuracy | rows in which the true mode was believed | rows with a true mode |
+| control_cost | x' Qx x + u' Ru u off what is to be held, mean over a run's rows (LQR) | runs |
 | nees, nis | normalised squares before the attack, 1 where covariances are honest | degrees |
 | unobservable_share, not_converged_share, diverged_share | rows with that status | rows |
 
@@ -71,6 +72,8 @@ def aggregated(
         if score in scores:
             columns = zip(names[kind], scores[score].T, strict=True)
             found |= {f"{score}:{name}": mean(values) for name, values in columns}
+    if "control_cost" in scores:
+        found["control_cost"] = mean(np.asarray(scores["control_cost"]))
     delay = np.asarray(scores["detection_delay"])
     attacked = delay[~np.isnan(delay)]
     caught = np.isfinite(attacked)
@@ -83,12 +86,14 @@ def aggregated(
 
 
 def mean(values: np.ndarray) -> Float[np.ndarray, " statistics"]:
-    """Of one number per run; NaN are left out."""
+    """Of one number per run; NaN are left out. An infinite mean has no interval."""
     values = values[~np.isnan(values)]
     if not len(values):
         return np.full(len(STATISTICS), np.nan)
-    middle = float(np.mean(values))
-    half = Z * np.std(values, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
+    with np.errstate(over="ignore"):  # costs of runs that diverge may be too large to add
+        middle = float(np.mean(values))
+        known = len(values) > 1 and np.isfinite(middle)
+        half = Z * np.std(values, ddof=1) / np.sqrt(len(values)) if known else np.nan
     return np.concatenate([[middle, middle - half, middle + half], _quantiles(values)])
 
 

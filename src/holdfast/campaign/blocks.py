@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Key, PRNGKeyArray
+from jaxtyping import Array, Bool, Int, Key, PRNGKeyArray
 
 from holdfast.campaign.attack_free import start_state
 from holdfast.campaign.run_scores import AsChannels, as_channels, margins, run_scores
@@ -61,9 +61,14 @@ def point_key(seed: int, name: str) -> PRNGKeyArray:
     return key
 
 
-@eqx.filter_jit
 def single(case: Case, key: PRNGKeyArray, run: int) -> Trace:
     """The record of run number ``run`` of a point."""
+    # as an array: a number would be part of the program, which each run would compile again
+    return _single(case, key, jnp.asarray(run))
+
+
+@eqx.filter_jit
+def _single(case: Case, key: PRNGKeyArray, run: Int[Array, ""]) -> Trace:
     return _simulated(case, jax.random.fold_in(key, run))
 
 

@@ -17,6 +17,8 @@ from holdfast.campaign.blocks import Block
 from holdfast.campaign.run_scores import bin_edges
 
 UNITS = {"detection_delay": "s"}
+ALONG = {"state": "state", "attack": "channel"}
+"""Dimension of what every state or every attack channel has; an axis may be called "attack"."""
 
 Point = tuple[int, ...]
 
@@ -27,7 +29,7 @@ def campaign_dataset(
     names: Mapping[Point, Mapping[str, tuple[str, ...]]],
     attrs: Mapping[str, Any],
 ) -> xr.Dataset:
-    """Every score of every run (axes, run, and state or attack), the ``summary`` (axes, score,
+    """Every score of every run (axes, run, and state or channel), the ``summary`` (axes, score,
     statistic), and the ROC curves (axes, margin).
 
     ``axes``: the labels on each. ``blocks``: those of each point, in order. ``names``: of the
@@ -53,7 +55,7 @@ def campaign_dataset(
             else:
                 places = [channels[kind].index(n) for n in names[point][kind]]
                 values[point][:, places] = found[score]
-        data[score] = ((*axes, "run", *(() if kind is None else (kind,))), values)
+        data[score] = ((*axes, "run", *(() if kind is None else (ALONG[kind],))), values)
     summaries = {point: aggregated(found, names[point]) for point, found in runs.items()}
     labels = list(dict.fromkeys(label for found in summaries.values() for label in found))
     table = np.full((*shape, len(labels), len(STATISTICS)), np.nan)
@@ -64,7 +66,8 @@ def campaign_dataset(
     data |= _curves(tuple(axes), shape, blocks)
     coords = {name: list(values) for name, values in axes.items()}
     coords |= {"run": np.arange(count), "score": labels, "statistic": list(STATISTICS)}
-    coords |= channels | {"margin": bin_edges()}
+    coords |= {ALONG[kind]: found for kind, found in channels.items()}
+    coords["margin"] = bin_edges()
     unit = [UNITS.get(label, "") for label in labels]
     return xr.Dataset(data, coords, dict(attrs)).assign_coords(unit=("score", unit))
 

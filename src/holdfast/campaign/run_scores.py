@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from holdfast.controllers.feedback import Feedback
 from holdfast.loop import Scenario
 from holdfast.numerics.linalg import mahalanobis
 from holdfast.parts import Plant
@@ -81,7 +82,10 @@ def _later(values: Float[Array, "t nd"], rows: int) -> Float[Array, "t nd"]:
 
 
 class Rows(NamedTuple):
-    """Which rows of a run are benign, attacked, and tested by the detector."""
+    """Which rows of a run are benign, attacked, and tested by the detector.
+
+    A row in which a bank believes in no attack has passed its test, as calibration counts it.
+    """
 
     benign: Bool[Array, " t"]
     attacked: Bool[Array, " t"]
@@ -98,7 +102,8 @@ def rows_of(trace: Trace) -> Rows:
         hit = hit | (injection.switch != 0)
     began = jnp.cumsum(hit.astype(jnp.int32)) > 0
     to_come = jnp.cumsum(hit[::-1].astype(jnp.int32))[::-1] > 0
-    return Rows(~began, began & to_come, jnp.isfinite(trace.verdict.threshold))
+    tested = jnp.isfinite(trace.verdict.threshold) | (trace.estimate.mode is not None)
+    return Rows(~began, began & to_come, tested)
 
 
 def run_scores(scenario: Scenario, trace: Trace, maps: AsChannels | None) -> dict[str, Any]:
@@ -130,6 +135,7 @@ def run_scores(scenario: Scenario, trace: Trace, maps: AsChannels | None) -> dic
         found |= _errors("attack", estimate.d - truth, estimate.d_cov)
     found |= _localised(scenario, trace, truth, rows)
     found |= _modes(scenario, trace, truth)
+    found |= _control(scenario, trace)
     for name in COUNTED:
         found[name.lower()] = _count((estimate.status & int(Status[name])) != 0)
     return found
@@ -207,11 +213,33 @@ def _modes(scenario: Scenario, trace: Trace, truth) -> dict[str, Array]:
     return {"mode_right": _count(right), "mode_rows": _count(known)}
 
 
+def _control(scenario: Scenario, trace: Trace) -> dict[str, Array]:
+    """The cost of the control, where the controller has weights (LQR): over the rows, the mean of
+
+        (x_k - r)' Qx (x_k - r) + (u_k - s)' Ru (u_k - s)
+
+    in the units of the weights, with the true state x_k, the reference r, the input s that holds
+    it, and u_k as commanded for k-1..k: ``trace.observation.u``, to which
+    `holdfast.loop.simulate` adds ``injection.u`` only inside the plant. What an attacker does to
+    the actuators is no effort of the controller; it costs by what it does to the state. Infinite
+    where the state has left the finite numbers.
+    """
+    controller = scenario.controller
+    if not isinstance(controller, Feedback) or controller.weights is None:
+        return {}
+    assert trace.x is not None
+    off, u = trace.x - controller.reference, trace.observation.u - controller.steady
+    Qx, Ru = controller.weights
+    cost = jnp.mean(jnp.sum(off @ Qx * off, 1) + jnp.sum(u @ Ru * u, 1))
+    return {"control_cost": jnp.where(jnp.isnan(cost), jnp.inf, cost)}
+
+
 def margins(trace: Trace) -> tuple[Int[Array, " bins"], Int[Array, " bins"]]:
     """How often statistic / threshold lies in each bin, in benign and in attacked rows."""
     rows, verdict = rows_of(trace), trace.verdict
-    tested = rows.tested & jnp.isfinite(verdict.statistic) & (verdict.threshold > 0)
-    ratio = jnp.where(tested, verdict.statistic / jnp.where(tested, verdict.threshold, 1.0), 1.0)
+    known = jnp.isfinite(verdict.statistic) & (verdict.threshold > 0)
+    ratio = jnp.where(known, verdict.statistic / jnp.where(known, verdict.threshold, 1.0), 0.0)
+    tested = rows.tested & (known | ~jnp.isfinite(verdict.threshold))
     place = jnp.floor(50.0 * (jnp.log10(jnp.maximum(ratio, 1e-300)) + 3.0)) + 1.0
     place = jnp.clip(place, 0, BINS - 1).astype(jnp.int32)
     empty = jnp.zeros(BINS, jnp.int32)

@@ -1,15 +1,16 @@
 """Linear state feedback from the estimate."""
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Float
 
 from holdfast.numerics.linalg import dot
-from holdfast.parts import Controller, InvalidValue, Plant
+from holdfast.parts import Controller, InvalidValue, Plant, no_attack, step_zero
 from holdfast.plants.constraints import Constraints, Polytope
 from holdfast.plants.linear import LinearPlant
 from holdfast.records import Estimate
@@ -19,15 +20,26 @@ MARGIN = 1e-7
 little of an input counts as none."""
 
 
+class Weights(NamedTuple):
+    """Qx and Ru of the cost x' Qx x + u' Ru u of a sample."""
+
+    state: Float[Array, "n n"]
+    input: Float[Array, "nu nu"]
+
+
 class Feedback(Controller):
-    """u = -K (x_hat - reference)."""
+    """u = steady - K (x_hat - reference); ``weights``: of the cost that K minimises, None where it
+    does not come from one.
+    """
 
     gain: Float[Array, "nu n"]
     reference: Float[Array, " n"]
+    steady: Float[Array, " nu"]
+    weights: Weights | None = None
 
     def command(self, estimate: Estimate) -> Float[Array, " nu"]:
         """The input to apply over the next sample."""
-        return -dot(self.gain, jnp.asarray(estimate.x) - self.reference)
+        return self.steady - dot(self.gain, jnp.asarray(estimate.x) - self.reference)
 
 
 def build(
@@ -36,25 +48,28 @@ def build(
     state_weight: list[list[float]],
     input_weight: list[list[float]],
     reference: list[float] | None = None,
+    command: list[float] | None = None,
 ) -> Feedback:
     """The feedback that minimises the sum of x' Qx x + u' Ru u (discrete LQR).
 
     K = (Ru + B' S B)^-1 B' S A with S the stabilising solution of the discrete Riccati
-    equation. ``state_weight`` (n x n, positive semidefinite), ``input_weight`` (nu x nu,
-    positive definite), ``reference`` the state to hold (n; default the origin), which has to
-    be an equilibrium of the plant without input for the error to vanish.
+    equation, x and u being deviations from ``reference``, the state to hold (n; default the
+    origin), and ``command``, the input that holds it (nu; default 0): the two have to be an
+    equilibrium of the plant for the error to vanish. ``state_weight`` (n x n, positive
+    semidefinite), ``input_weight`` (nu x nu, positive definite). A nonlinear plant is linearised
+    there.
 
-    Raises `InvalidValue` for a plant that is not linear and constant, that (A, B) cannot
-    stabilise, or whose unstable modes ``state_weight`` does not see; for a weight of wrong
-    shape or sign.
+    Raises `InvalidValue` for a linear plant whose matrices change, one without input, that
+    (A, B) cannot stabilise, or whose unstable modes ``state_weight`` does not see; for a weight of wrong shape or sign.
     """
-    _, A, B = steered(plant)
+    found = held(reference, len(plant.states))
+    steady = held(command, len(plant.inputs), "command", "input")
+    A, B = _matrices(plant, found, steady)
     n, nu = B.shape
     states = _weight("state_weight", state_weight, n)
     inputs = _weight("input_weight", input_weight, nu)
     if np.linalg.eigvalsh(inputs)[0] <= 0:
         raise InvalidValue("input_weight", input_weight, "a positive definite matrix")
-    found = held(reference, n)
     stuck = _unreached(A, B)
     if stuck is not None:
         raise InvalidValue(
@@ -67,7 +82,23 @@ def build(
         )
     S = scipy.linalg.solve_discrete_are(A, B, states, inputs)
     K = np.linalg.solve(inputs + B.T @ S @ B, B.T @ S @ A)
-    return Feedback(jnp.asarray(K), jnp.asarray(found))
+    weights = Weights(jnp.asarray(states), jnp.asarray(inputs))
+    return Feedback(jnp.asarray(K), jnp.asarray(found), jnp.asarray(steady), weights)
+
+
+def _matrices(plant: Plant, x: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A and B of the plant, or of its linearisation at ``x`` and ``u``."""
+    if isinstance(plant, LinearPlant):
+        return steered(plant)[1:]
+    if not plant.inputs:
+        raise InvalidValue("plant", "no inputs", "at least one input to steer with")
+
+    def moved(x, u):
+        return plant.transition(step_zero() + 1, x, u, no_attack(plant))
+
+    jacobians = jax.jacfwd(moved, (0, 1))(jnp.asarray(x), jnp.asarray(u))
+    A, B = (np.asarray(found, float) for found in jacobians)
+    return A, B
 
 
 def steered(plant: Plant) -> tuple[LinearPlant, np.ndarray, np.ndarray]:
@@ -83,11 +114,13 @@ def steered(plant: Plant) -> tuple[LinearPlant, np.ndarray, np.ndarray]:
     return plant, A, B
 
 
-def held(reference: list[float] | None, n: int) -> np.ndarray:
-    """The state to hold (n,): the origin unless given; `InvalidValue` where it is none."""
-    found = np.zeros(n) if reference is None else np.asarray(reference, float)
+def held(
+    given: list[float] | None, n: int, key: str = "reference", of: str = "state"
+) -> np.ndarray:
+    """The state (or input) to hold (n,): 0 unless given; `InvalidValue` where it is none."""
+    found = np.zeros(n) if given is None else np.asarray(given, float)
     if found.shape != (n,) or not np.all(np.isfinite(found)):
-        raise InvalidValue("reference", reference, f"{n} finite numbers, one per state")
+        raise InvalidValue(key, given, f"{n} finite numbers, one per {of}")
     return found
 
 

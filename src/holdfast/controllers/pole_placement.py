@@ -40,7 +40,7 @@ def build(
     _, A, B = steered(plant)
     found = held(reference, len(A))
     K = placed(A, B, _numbers(poles, len(A)))
-    return Feedback(jnp.asarray(K), jnp.asarray(found))
+    return Feedback(jnp.asarray(K), jnp.asarray(found), jnp.zeros(len(K)))
 
 
 def placed(A: np.ndarray, B: np.ndarray, poles: np.ndarray) -> np.ndarray:

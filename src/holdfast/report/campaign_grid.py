@@ -13,6 +13,7 @@ FAMILIES = {
     "detection": ("detection_delay", "detected_share", "missed_share", "false_alarm_rate"),
     "state_rmse": ("state_rmse",),
     "attack_rmse": ("attack_rmse",),
+    "control_cost": ("control_cost",),
 }
 """The scores that are drawn; those of one family stand in one figure."""
 SHARES = ("share", "rate", "accuracy", "precision", "recall")

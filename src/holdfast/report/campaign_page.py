@@ -15,7 +15,8 @@ from holdfast.report.words import DASH, NBSP, count, number
 
 ROWS = 500
 """Points that the page lists at most."""
-LOWER = ("state_rmse", "attack_rmse", "detection_delay", "missed_share", "false_alarm_rate")
+LOWER = ("state_rmse", "attack_rmse", "detection_delay", "missed_share", "false_alarm_rate",
+         "control_cost")  # fmt: skip
 HIGHER = ("detected_share", "mode_accuracy", "localisation_precision", "localisation_recall", "auc")
 """Scores of which less, or more, is better; of all others neither."""
 ATTRIBUTES = {
@@ -36,6 +37,7 @@ _SHOWS = {
     "detection": "Detection",
     "state_rmse": "Error of the state estimate",
     "attack_rmse": "Error of the attack estimate",
+    "control_cost": "Cost of the control",
 }
 _DELAY = " The delay is that of the runs with an alarm."
 

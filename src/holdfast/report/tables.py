@@ -224,7 +224,8 @@ def _detection(
 def _false_alarms(
     data: xr.Dataset, runs: list[dict[str, Any]], benign: np.ndarray, dt: float
 ) -> dict[str, Any]:
-    tested = np.isfinite(data.threshold.values)
+    # a row in which a bank believes in no attack has passed its test, as calibration counts it
+    tested = np.isfinite(data.threshold.values) | ("mode" in data)
     rows = np.broadcast_to(benign, tested.shape)
     count = sum(run.get("episodes_before", len(run["episodes"])) for run in runs)
     return {

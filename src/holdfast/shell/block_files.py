@@ -38,11 +38,13 @@ class BlockFiles:
 
     A file is named by its point, its first run, the number of runs and a checksum of its
     content, so that a damaged or half-copied one is found out and its runs made again.
+    ``traces``: what the manifest says of a store of records, None where there is none.
     """
 
     def __init__(self, folder: str | Path, study: Study):
         self.folder, self.study = Path(folder), study
         self.names = {study.name_of(point): self.named(point) for point in study.points}
+        self.traces: dict[str, Any] | None = None
         self._check_begun()
 
     def named(self, point: tuple[int, ...]) -> str:
@@ -60,7 +62,7 @@ class BlockFiles:
             return
         try:
             begun = json.loads(path.read_text(encoding="utf-8"))
-            digest, made = begun["digest"], begun["versions"]
+            digest, made, traces = begun["digest"], begun["versions"], begun.get("traces")
         except (OSError, ValueError, KeyError, TypeError):
             raise InputError(path, "", "no manifest of a campaign", "another folder") from None
         if digest != self.study.digest:
@@ -75,6 +77,7 @@ class BlockFiles:
                 self.folder, "", f"blocks made with {other}",
                 "the same versions, or another folder: last digits may differ",
             )  # fmt: skip
+        self.traces = traces if isinstance(traces, dict) else None
 
     def begin(self) -> None:
         """Make the folder and write the manifest, before the first block."""
@@ -102,6 +105,7 @@ class BlockFiles:
                 for point in study.points
             ],
             "blocks": {name: _NAME.fullmatch(name)[4] for name in files},  # type: ignore[index]
+            "traces": self.traces,
         }
         write_text(self.folder / MANIFEST, json.dumps(found, indent=1) + "\n")
 

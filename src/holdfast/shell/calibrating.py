@@ -45,10 +45,10 @@ ROWS = 400
 """Rows of a run that count."""
 
 
-def calibrated_scenario(found: ScenarioFile) -> tuple[Scenario, Calibration]:
+def calibrated_scenario(found: ScenarioFile, *, alone: bool = True) -> tuple[Scenario, Calibration]:
     """The scenario with its detector calibrated as [detector] asks, and how that was done.
 
-    Raises `InputError`.
+    ``alone``: whether nothing else says on the terminal how far it is. Raises `InputError`.
     """
     monitor, controller = found.scenario.monitor, found.scenario.controller
     try:
@@ -63,7 +63,7 @@ def calibrated_scenario(found: ScenarioFile) -> tuple[Scenario, Calibration]:
             how = _read(kept)
             if how is None:
                 runs = _runs(monitor)
-                with busy("calibrating the threshold"):
+                with busy("calibrating the threshold") if alone else contextlib.nullcontext():
                     monitor, how = calibrated(monitor, controller=controller, runs=runs)
                 _keep(kept, how)
             else:

@@ -19,11 +19,12 @@ from holdfast.campaign.dataset import campaign_dataset
 from holdfast.shell import runtime
 from holdfast.shell.block_files import BlockFiles
 from holdfast.shell.errors import InputError
-from holdfast.shell.executors import Cluster, Local, Task, cores
+from holdfast.shell.executors import Cluster, Local, Task
 from holdfast.shell.points import Prepared, prepare
 from holdfast.shell.progress import progress
 from holdfast.shell.reading import size_in_words
 from holdfast.shell.study import Study, read_study
+from holdfast.shell.traces import STORE, check_wanted, store_bytes, write_traces
 from holdfast.shell.writing import check_place, replacing, write_figures, write_text
 
 MEMORY = 3 * 2**30
@@ -74,12 +75,29 @@ def run_study(
 
     Raises `holdfast.shell.errors.InputError`: file, key, what was found, what was expected.
     """
+    return study_results(
+        path, output, scheduler=scheduler, workers=workers, allow_python=allow_python, told=told
+    )[1]
+
+
+def study_results(
+    path: str | Path,
+    output: str | Path | None,
+    *,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    allow_python: bool = False,
+    told: Callable[[str], None] = lambda line: None,
+) -> tuple[Prepared, xr.Dataset]:
+    """What `run_study` runs, and what it gives."""
     if output is not None:
         check_place(output)
     study = read_study(path)
+    check_wanted(study, output)
     files = None if output is None else BlockFiles(output, study)
     with progress("points", len(study.points)) as advance:
         prepared = prepare(study, allow_python, advance=lambda: advance(1))
+    size = store_bytes(prepared)
     executor: Local | Cluster
     if scheduler is not None:
         executor = Cluster(prepared, scheduler, allow_python)
@@ -87,6 +105,9 @@ def run_study(
         executor = Local(prepared, _threads(prepared, workers))
     if files is not None:
         files.begin()
+    if size:
+        told(f"records of {_counted(study.settings.traces, 'run')} of each point to {STORE}, "
+             f"about {size_in_words(size)} before compression")  # fmt: skip
     found = {} if files is None else files.read()
     try:
         seconds, made = _run(prepared, executor, files, found, told)
@@ -96,7 +117,9 @@ def run_study(
     result = _dataset(prepared, found, _attrs(study, output, seconds, made, prepared))
     if files is not None:
         _write(files, result)
-    return result
+        with progress("records", study.settings.traces * len(study.points)) as advance:
+            write_traces(files, prepared, lambda: advance(1))
+    return prepared, result
 
 
 def _say(line: str) -> None:
@@ -147,7 +170,7 @@ def _tasks(prepared: Prepared, found: Found, blocks: int, per_file: int) -> Iter
 def _threads(prepared: Prepared, wanted: int | None) -> int:
     """Blocks at a time: as many as there are cores, as long as memory lasts."""
     most = max(1, MEMORY // block_bytes(prepared))
-    return min(wanted or cores(), most)
+    return min(wanted or runtime.cores(), most)
 
 
 def block_bytes(prepared: Prepared) -> int:

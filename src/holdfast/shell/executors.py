@@ -28,13 +28,6 @@ class Task(NamedTuple):
     blocks: int
 
 
-def cores() -> int:
-    """Processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 def computed(prepared: Prepared, task: Task) -> list[Block]:
     """The blocks of a task."""
     case, key = prepared.cases[task.point], prepared.keys[task.point]

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ from holdfast.campaign.choice import structure_of, together
 from holdfast.loop import Scenario
 from holdfast.parts import Plant
 from holdfast.plants.linear import LinearPlant
+from holdfast.shell import runtime
 from holdfast.shell.calibrating import calibrated_scenario
 from holdfast.shell.errors import InputError
 from holdfast.shell.scenario import ScenarioFile, build_scenario
@@ -46,29 +48,26 @@ def prepare(
 ) -> Prepared:
     """Build every point; ``values``: of a calibration made before. Raises `InputError`."""
     plants: dict[str, Plant] = {}
-    calibrations: dict[str, float | None] = {}
-    scenarios, found_values, steps = [], [], []
-    for number, point in enumerate(study.points):
+    built: list[tuple[ScenarioFile, Scenario]] = []
+    steps = []
+    for point in study.points:
         try:
-            found, scenario = _built(study, point, allow_python, plants)
-            if values is None:
-                scenario, value = _calibrated(found, scenario, calibrations)
-            else:
-                scenario, value = _with(scenario, values[number])
+            built.append(_built(study, point, allow_python, plants))
         except InputError as error:
             raise _at_point(study, point, error) from None
-        scenarios.append(scenario)
-        found_values.append(value)
+        found, scenario = built[-1]
         steps.append(study.settings.steps or found.run.steps)
         _check_steps(study, scenario, steps[-1])
-        advance()
+    if values is None:
+        values = _calibrations(study, [found for found, _ in built], advance)
+    scenarios = [_with(scenario, v) for (_, scenario), v in zip(built, values, strict=True)]
     scenarios, programs = _grouped(scenarios)
     drawn = study.settings.start == "drawn"
     cases = tuple(case_of(s, n, drawn) for s, n in zip(scenarios, steps, strict=True))
     common = study.settings.common_noise
     names = [COMMON if common else study.name_of(point) for point in study.points]
     keys = tuple(point_key(study.settings.seed, name) for name in names)
-    return Prepared(study, cases, keys, tuple(found_values), programs)
+    return Prepared(study, cases, keys, tuple(values), programs)
 
 
 def _built(
@@ -105,25 +104,39 @@ def _named(plant: dict[str, Any]) -> str:
     return json.dumps({k: v for k, v in plant.items() if k != "x0"}, sort_keys=True, default=repr)
 
 
-def _calibrated(
-    found: ScenarioFile, scenario: Scenario, known: dict[str, float | None]
-) -> tuple[Scenario, float | None]:
-    """The scenario with a calibrated detector; the same monitor is calibrated once."""
-    name = content_key(
-        (found.scenario.monitor, found.scenario.controller),
-        (str(found.threshold), str(found.calibrate)),
-    )
-    if name not in known:
-        _, how = calibrated_scenario(found)
-        known[name] = how.value if how.method in ("simulated", "log") else None
-    return _with(scenario, known[name])
+def _calibrations(
+    study: Study, found: list[ScenarioFile], advance: Callable[[], None]
+) -> list[float | None]:
+    """What calibration gives the detector of every point; the same monitor is calibrated once,
+    and several at a time: compiled code runs without Python's lock.
+    """
+    parts = [(f.scenario.monitor, f.scenario.controller) for f in found]
+    names = [
+        content_key(p, (str(f.threshold), str(f.calibrate)))
+        for p, f in zip(parts, found, strict=True)
+    ]
+    with ThreadPoolExecutor(runtime.cores()) as pool:
+        at_work = {}
+        for name, scenario in zip(names, found, strict=True):
+            if name not in at_work:
+                at_work[name] = pool.submit(calibrated_scenario, scenario, alone=False)
+        values = []
+        for point, name in zip(study.points, names, strict=True):
+            try:
+                how = at_work[name].result()[1]
+            except InputError as error:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise _at_point(study, point, error) from None
+            values.append(how.value if how.method in ("simulated", "log") else None)
+            advance()
+    return values
 
 
-def _with(scenario: Scenario, value: float | None) -> tuple[Scenario, float | None]:
+def _with(scenario: Scenario, value: float | None) -> Scenario:
     if value is None:
-        return scenario, None
+        return scenario
     monitor = with_value(scenario.monitor, value)
-    return eqx.tree_at(lambda s: s.monitor, scenario, monitor), value
+    return eqx.tree_at(lambda s: s.monitor, scenario, monitor)
 
 
 def _grouped(scenarios: list[Scenario]) -> tuple[list[Scenario], int]:

@@ -28,6 +28,13 @@ def configure() -> Path | None:
     return folder
 
 
+def cores() -> int:
+    """Processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def cache_folder() -> Path | None:
     """The folder for compiled code, made if need be; None if off, or if it is not ours alone."""
     wish = os.environ.get("HOLDFAST_CACHE", "")

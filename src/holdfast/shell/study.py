@@ -37,6 +37,7 @@ class StudySettings(Strict):
     seed: int = Field(0, ge=0, lt=2**63, description="a whole number from 0 up")
     start: Literal["drawn", "fixed"] = Field("drawn", description="one of 'drawn', 'fixed'")
     common_noise: bool = Field(False, description="true or false")
+    traces: int = Field(0, ge=0, description="a whole number from 0 up")
 
 
 class StudyTables(Strict):
@@ -110,7 +111,7 @@ class Study:
     @property
     def digest(self) -> str:
         """Of all that decides what the runs of a point give, but for its axes."""
-        settings = self.settings.model_dump(exclude={"runs", "scenario"})
+        settings = self.settings.model_dump(exclude={"runs", "scenario", "traces"})
         text = json.dumps([settings, self.content], sort_keys=True, default=repr)
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -143,7 +144,11 @@ def _settings(path: str, source: str) -> tuple[Any, Any]:
     reject_unusable(content, path)
     folder = Path(path).parent
     tables: Any = Table(path, "", content, folder).checked(StudyTables)
-    return Table(path, "study", tables.study, folder).checked(StudySettings), tables
+    settings: Any = Table(path, "study", tables.study, folder).checked(StudySettings)
+    if settings.traces > settings.runs:
+        expected = f"at most {settings.runs}, the runs of a point"
+        raise InputError(path, "study.traces", str(settings.traces), expected)
+    return settings, tables
 
 
 def check_name(file: str, key: str, name: str) -> None:

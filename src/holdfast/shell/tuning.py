@@ -17,7 +17,7 @@ from holdfast.campaign.tune import Judged, Span, Trial, tuned
 from holdfast.report.tables import json_safe
 from holdfast.shell import runtime
 from holdfast.shell.errors import InputError, one_of, shown
-from holdfast.shell.executors import Local, Task, cores
+from holdfast.shell.executors import Local, Task
 from holdfast.shell.points import Prepared, prepare
 from holdfast.shell.progress import progress
 from holdfast.shell.schema import Strict, Table
@@ -126,7 +126,7 @@ class _Scores:
         blocks = math.ceil(runs / BLOCK)
         tasks = [Task(i, 0, blocks) for i in range(len(prepared.cases))]
         self.by_point: list[dict[str, float]] = [{} for _ in tasks]
-        for task, found in Local(prepared, cores()).run(tasks):
+        for task, found in Local(prepared, runtime.cores()).run(tasks):
             plant = prepared.cases[task.point].scenario.plant
             names = {"state": plant.states, "attack": plant.attacks}
             joined = {

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -38,6 +39,39 @@ def replacing(path: str | Path) -> Iterator[Path]:
         raise unwritable(path, error) from None
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def replacing_folder(path: str | Path) -> Iterator[Path]:
+    """A temporary folder beside ``path``; it takes that name, as a whole, if all goes well.
+
+    On any failure it is removed and ``path`` is left as it was. What an earlier one that was
+    killed has left is removed first.
+    """
+    path = Path(os.path.realpath(path))
+    if path.exists() and not path.is_dir():
+        raise InputError(path, "", _kind_of(path), "the name of a folder to write")
+    beginning = f".{path.name}."
+    try:
+        for left in path.parent.iterdir():
+            if left.name.startswith(beginning) and left.is_dir():
+                shutil.rmtree(left)
+        place = Path(tempfile.mkdtemp(prefix=beginning, dir=path.parent))
+        temporary, old = place / "new", place / "old"
+        temporary.mkdir()
+    except OSError as error:
+        raise unwritable(path, error) from None
+    try:
+        yield temporary
+        if path.exists():  # a folder can take the place of an empty one only
+            os.replace(path, old)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise unwritable(path, error) from None
+    finally:
+        if old.exists() and not path.exists():
+            os.replace(old, path)
+        shutil.rmtree(place, ignore_errors=True)
 
 
 def write_text(path: str | Path, text: str) -> None:
