@@ -94,8 +94,9 @@ def test_matplotlib_only_in_figures():
     users = {m for m in FILES if any(n.split(".")[0] == "matplotlib" for n in imported(m))}
     assert users <= {
         f"holdfast.report.{name}"
-        for name in ("figures", "mode_figures", "paper_figures", "roc_figure", "campaign_figures")
-    }
+        for name in ("figures", "mode_figures", "paper_figures", "roc_figure", "campaign_figures",
+                     "arena_figures")
+    }  # fmt: skip
 
 
 OUTSIDE = {

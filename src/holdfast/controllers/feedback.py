@@ -60,7 +60,8 @@ def build(
     there.
 
     Raises `InvalidValue` for a linear plant whose matrices change, one without input, that
-    (A, B) cannot stabilise, or whose unstable modes ``state_weight`` does not see; for a weight of wrong shape or sign.
+    (A, B) cannot stabilise, or whose unstable modes ``state_weight`` does not see; for a weight
+    of wrong shape or sign.
     """
     found = held(reference, len(plant.states))
     steady = held(command, len(plant.inputs), "command", "input")

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from holdfast.numerics.l1_vertex import Vertex, corner, vertex
-from holdfast.numerics.linalg import SMALL
+from holdfast.numerics.linalg import SMALL, backward, cholesky, forward
 from holdfast.numerics.reduced import Reduced, reduced
 
 ROUNDS = 40
@@ -243,7 +243,7 @@ def _factor(columns, q, absent):
     gram = (columns * q[:, None]).T @ columns
     ridge = absent + 1e-14 * jnp.max(jnp.diagonal(gram))
     if n > SMALL:
-        return jnp.linalg.cholesky(gram + jnp.diag(ridge))
+        return cholesky(gram + jnp.diag(ridge))
     lower: list[list[Array]] = []
     for i in range(n):
         row: list[Array] = []
@@ -258,7 +258,7 @@ def _factor(columns, q, absent):
 def _solved(factor, right: Float[Array, " n"]) -> Float[Array, " n"]:
     """The solution with the factor of `_factor`."""
     if not isinstance(factor, list):
-        return jax.scipy.linalg.cho_solve((factor, True), right)
+        return backward(factor, forward(factor, right))
     n = len(factor)
     half: list[Array] = []
     for i in range(n):

@@ -27,6 +27,22 @@ def one_at_a_time(function: Callable[..., Any]) -> Callable[..., Any]:
     return jax.custom_batching.sequential_vmap(function)
 
 
+cholesky = one_at_a_time(jnp.linalg.cholesky)
+"""The lower factor of a matrix."""
+
+
+@one_at_a_time
+def forward(lower, b):
+    """L^-1 b for a lower triangular L."""
+    return jax.scipy.linalg.solve_triangular(lower, b, lower=True)
+
+
+@one_at_a_time
+def backward(lower, b):
+    """L^-T b for a lower triangular L."""
+    return jax.scipy.linalg.solve_triangular(lower, b, trans=1, lower=True)
+
+
 def dot(a: Float[Array, "..."], b: Float[Array, "..."]) -> Float[Array, "..."]:
     """A @ b for matrices and vectors, as a fusible sum where the matrices are small.
 
@@ -148,17 +164,12 @@ def solve_lower(
     if n > SMALL:
         safe = jnp.where(kept[:, None], lower, 0.0) + jnp.diag(jnp.where(kept, 0.0, 1.0))
         masked = jnp.where(kept.reshape((n,) + (1,) * (b.ndim - 1)), b, 0.0)
-        return _solve_triangular(safe, masked)
+        return forward(safe, masked)
     found: list[Array] = []
     for i in range(n):
         rest = b[i] - sum(lower[i, j] * found[j] for j in range(i))
         found.append(jnp.where(kept[i], rest / jnp.where(kept[i], lower[i, i], 1.0), 0.0))
     return jnp.stack(found) if found else b
-
-
-@one_at_a_time
-def _solve_triangular(lower, b):
-    return jax.scipy.linalg.solve_triangular(lower, b, lower=True)
 
 
 def mahalanobis(

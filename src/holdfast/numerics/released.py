@@ -2,11 +2,10 @@
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from holdfast.numerics.linalg import RANK_TOLERANCE, dot
+from holdfast.numerics.linalg import RANK_TOLERANCE, backward, cholesky, dot, forward
 
 
 class Released(NamedTuple):
@@ -27,7 +26,7 @@ class Released(NamedTuple):
         scale = jnp.where(marked & (length > 0), 1.0 / jnp.where(length > 0, length, 1.0), 0.0)
         unit = scale[:, None] * columns
         gram = dot(unit, unit.T)
-        lower = jnp.linalg.cholesky(gram + jnp.diag(jnp.where(marked, RANK_TOLERANCE**1.5, 1.0)))
+        lower = cholesky(gram + jnp.diag(jnp.where(marked, RANK_TOLERANCE**1.5, 1.0)))
         pivots = jnp.where(marked, jnp.diagonal(lower) ** 2, 1.0)
         dependent = ~jnp.all(pivots > RANK_TOLERANCE)
         return cls(marked, scale, jnp.where(dependent, jnp.eye(len(marked)), lower), dependent)
@@ -36,9 +35,8 @@ class Released(NamedTuple):
         """H with H' H = b' (Z_A Z_A')^-1 b."""
         shape = (-1,) + (1,) * (b.ndim - 1)
         scaled = self.scale.reshape(shape) * b
-        return jax.scipy.linalg.solve_triangular(self.lower, scaled, lower=True)
+        return forward(self.lower, scaled)
 
     def solve(self, b: Float[Array, " M"]) -> Float[Array, " M"]:
         """(Z_A Z_A')^-1 b on the marked columns, 0 elsewhere."""
-        back = jax.scipy.linalg.solve_triangular(self.lower, self.half(b), trans=1, lower=True)
-        return self.scale * back
+        return self.scale * backward(self.lower, self.half(b))

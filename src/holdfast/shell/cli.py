@@ -252,6 +252,29 @@ def campaign(
 
 
 @app.command()
+def arena(
+    plants: Annotated[
+        list[str] | None,
+        typer.Argument(help="Plants, such as vehicle. Default: all there are.", show_default=False),
+    ] = None,
+    output: Annotated[
+        str | None,
+        typer.Option(
+            "-o", help="Folder for tables, figures, report and studies; one that is there is gone "
+            "on with. Default: print the tables.", show_default=False,
+        ),
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="One plant, in some minutes.")
+    ] = False,
+) -> None:  # fmt: skip
+    """Every estimator and detector against every attack, and what was promised of each."""
+    from holdfast.shell import arena
+
+    arena.arena(plants, output, quick)
+
+
+@app.command()
 def tune(
     study: Annotated[
         str, typer.Argument(help="Study with [tune] and [settings] (TOML).", show_default=False)
