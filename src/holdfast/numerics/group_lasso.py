@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from holdfast.numerics.lasso import Solution
+from holdfast.numerics.linalg import backward, cholesky, forward
 
 ROUNDING = 1e-13
 """Violation, relative to max w + the largest |Z_g c|, at which a solution is one."""
@@ -198,8 +199,8 @@ def _newton(problem: _Problem, f, at: _State):
     diagonal = jnp.where(there, (1.0 + RIDGE) * jnp.diagonal(H) + RIDGE * jnp.max(H), 1.0)
     H = H - jnp.diag(jnp.diagonal(H)) + jnp.diag(diagonal)
     root = 1.0 / jnp.sqrt(diagonal)
-    factor = jax.scipy.linalg.cho_factor(root[:, None] * H * root[None], lower=True)
-    step = -root * jax.scipy.linalg.cho_solve(factor, root * at.missed)
+    factor = cholesky(root[:, None] * H * root[None])
+    step = -root * backward(factor, forward(factor, root * at.missed))
     return jnp.where(jnp.all(jnp.isfinite(step)), step, -at.missed / diagonal)
 
 
