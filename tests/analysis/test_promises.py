@@ -78,11 +78,11 @@ def test_the_size_of_a_sum_of_moduli():
     assert _size_of_sum(root @ root.T) == pytest.approx(np.sqrt(np.mean(drawn**2)), rel=5e-3)
 
 
-HIT = np.eye(5, dtype=bool)[[0, 4]]
+HIT = [np.eye(5, dtype=bool)[0], pytest.param(np.eye(5, dtype=bool)[4], marks=pytest.mark.slow)]
 SIZES = np.array([0.0, 0.5, 3.0, 1e3, 1e6])
 
 
-@pytest.mark.parametrize("weights", ["none", "noise"])
+@pytest.mark.parametrize("weights", ["none", pytest.param("noise", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("mask", HIT, ids=["a receiver", "the worse speed"])
 def test_no_attack_on_a_decoder_exceeds_its_bound(weights, mask):
     """Attacks of all sizes keep the bound in the mean, and it is not infinite."""
@@ -180,6 +180,7 @@ def test_the_fusion_promises_what_the_paper_says_of_its_sensors():
     assert finite == [True, False, False, True, True]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("oscillating", [False, True], ids=["real", "complex"])
 def test_no_attack_on_a_fusion_exceeds_its_bound(oscillating):
     changes = {}

@@ -47,7 +47,11 @@ def test_a_batched_call_is_found():
 @pytest.mark.parametrize(
     ("kind", "n"),
     # a bank of local filters is as large with six states as others are with twelve
-    [(kind, n) for kind in ESTIMATORS for n in (3, 6 if kind == "secure_fusion" else 12)],
+    [(kind, 3) for kind in ESTIMATORS]
+    + [
+        pytest.param(kind, 6 if kind == "secure_fusion" else 12, marks=pytest.mark.slow)
+        for kind in ESTIMATORS
+    ],
 )
 def test_a_step_of_many_runs_has_none(kind, n):
     plant = plant_of(n)
