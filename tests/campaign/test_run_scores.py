@@ -84,6 +84,9 @@ def test_bins_hold_the_margins(run):
     benign, attacked = map(np.asarray, margins(jax.tree.map(jax.numpy.asarray, trace)))
     ratio = trace.verdict.statistic / trace.verdict.threshold
     tested = np.isfinite(trace.verdict.threshold)
+    if trace.estimate.mode is not None:
+        # a row in which a bank believes in no attack has passed its test
+        ratio, tested = np.where(tested, ratio, 0.0), np.ones(len(tested), bool)
     hit = np.zeros(len(ratio), bool)
     for part in (trace.injection.u, trace.injection.y, trace.injection.d):
         hit |= np.any(part != 0, 1)
