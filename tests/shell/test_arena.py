@@ -162,6 +162,15 @@ def test_a_plant_that_there_is_not():
         arena.run_arena(["vehicles"])
 
 
+def test_a_folder_that_cannot_be(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="file"):
+        arena.run_arena(["vehicle"], tmp_path / "file")
+    (tmp_path / "vehicle").write_text("")
+    with pytest.raises(InputError, match="vehicle"):
+        arena.run_arena(["vehicle"], tmp_path)
+
+
 def test_every_plant_has_a_comparison_that_begins_without_attack():
     found = arena.grounds()
     assert len(found) == 7

@@ -1,6 +1,5 @@
 """`holdfast arena`: every estimator and detector against every attack, on plants of all kinds."""
 
-import shutil
 import sys
 import time
 import warnings
@@ -12,10 +11,10 @@ import pandas as pd
 
 from holdfast.shell import runtime
 from holdfast.shell.arena_cases import cases_of
-from holdfast.shell.campaigning import study_results
+from holdfast.shell.campaigning import INTERRUPTED, study_results
 from holdfast.shell.errors import InputError, one_of
 from holdfast.shell.progress import progress
-from holdfast.shell.writing import check_place, write_figures, write_text
+from holdfast.shell.writing import check_place, unwritable, write_figures, write_text
 
 GROUNDS = "holdfast.shell.grounds"
 """A folder for each plant: the scenario, and the studies on it."""
@@ -46,7 +45,12 @@ def arena(names: list[str] | None, output: str | None, quick: bool) -> None:
 
     runtime.configure()
     start = time.perf_counter()
-    found = run_arena(names, output, quick=quick, told=_say)
+    try:
+        found = run_arena(names, output, quick=quick, told=_say)
+    except KeyboardInterrupt:
+        if output is not None:
+            _say(f"interrupted: what is finished is in {output}; the same command goes on")
+        sys.exit(INTERRUPTED)
     minutes = (time.perf_counter() - start) / 60
     if output is None:
         print(markdown(found))
@@ -97,9 +101,12 @@ def _ran(ground: str, name: str, output: Path | None) -> pd.DataFrame:
         if output is not None:
             # what ran stands beside its results, and runs again by itself
             folder, target = output / ground, output / ground / name
-            folder.mkdir(parents=True, exist_ok=True)
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise unwritable(folder, error) from None
             for file in (SCENARIO, f"{name}.toml"):
-                shutil.copyfile(source / file, folder / file)
+                write_text(folder / file, (source / file).read_text("utf-8"))
         with warnings.catch_warnings():
             # a large bank is not calibrated: said once is enough, not for every attack
             warnings.filterwarnings(
