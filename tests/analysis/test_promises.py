@@ -128,6 +128,32 @@ def errors_of(plant, estimator, attacks, steps=30, runs=50, skip=5):
     return (found.reshape(len(y), runs, steps, n) - x)[:, :, skip:]
 
 
+def test_three_like_sensors_in_closed_form():
+    """Window of one row: kappa = 1/2, m = 1/2, so the bound is 2 (|e_2| + |e_3|), whose mean
+    square is 4 (2 + 4 / pi).
+    """
+    plant = linear_plant(A=[[1.0]], C=np.ones((3, 1)), Q=[[0.0]], R=np.eye(3))
+    estimator = l1_decoder.build(plant, np.zeros(1), np.eye(1), window=1)
+    assert estimator.window.laid is not None
+    bound = of_decoder(model_at(plant, np.zeros(1)), estimator.window.laid, False,
+                       sensors([1, 0, 0]))  # fmt: skip
+    assert bound == pytest.approx(2.0 * np.sqrt(2.0 + 4.0 / np.pi), rel=1e-9)
+
+
+def test_the_bound_of_a_scalar_fusion_by_hand():
+    plant = linear_plant(A=[[0.9]], C=np.ones((4, 1)), Q=[[1.0]], R=np.diag([1.0, 2.0, 1.0, 3.0]))
+    local, gamma = fused(plant), 2.0
+    # the paper's coordinate of a bank of one mode is the one with b = 1
+    G, W = local.G[:, 0] / local.b[0], local.W / local.b[0] ** 2
+    kappa = abs(G[0]) / np.sum(np.abs(G[1:]))
+    drawn = np.random.default_rng(0).multivariate_normal(np.zeros(3), W[1:, 1:], 1_000_000)
+    noise = np.sqrt(np.mean(np.sum(np.abs(drawn), 1) ** 2))
+    lost = gamma / 2 * np.sum(np.abs(W))
+    by_hand = (2 * noise + lost) / np.sum(np.abs(G[1:])) / (1 - kappa)
+    # a million draws know the noise to 0.1 %
+    assert of_fusion(local, gamma, sensors([1, 0, 0, 0])) == pytest.approx(by_hand, rel=5e-3)
+
+
 def test_where_the_others_can_be_outvoted_a_decoder_promises_nothing():
     plant = three_receivers()
     estimator = l1_decoder.build(plant, np.zeros(2), np.eye(2), window=4)

@@ -162,6 +162,11 @@ def test_a_plant_that_there_is_not():
         arena.run_arena(["vehicles"])
 
 
+def test_quick_is_a_plant_of_its_own():
+    with pytest.raises(InputError, match="--quick"):
+        arena.run_arena(["cruise"], quick=True)
+
+
 def test_a_folder_that_cannot_be(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="file"):

@@ -77,7 +77,9 @@ def run_arena(
     """
     if output is not None:
         check_place(output)
-    wanted = list(_wanted([QUICK] if quick and not names else names))
+    if quick and names:
+        raise InputError("arena", "--quick", f"plants as well ({', '.join(names)})", "one of both")
+    wanted = list(_wanted([QUICK] if quick else names))
     tables = []
     with progress("studies", len(wanted)) as advance:
         for ground, study in wanted:

@@ -55,8 +55,10 @@ class Promises:
         hit = hit_of(plant, attacks)
         if not self._true or not _constant(plant) or hit is None:
             return None
+        if scenario.enforcement is not None:
+            return None  # a decoder meets authenticated samples first, noise and all
         if kinds == {"stealthy"} and isinstance(estimator, Kalman):
-            return self._of_stealth(number, attacks[0], hit)
+            return self._of_stealth(number, quiet, attacks[0], hit)
         name = (quiet, *hit.inputs, *hit.outputs, *hit.attacks, hit.at_once)
         if name not in self._known:
             self._known[name] = self._of_channels(estimator, plant, quiet, hit)
@@ -66,11 +68,11 @@ class Promises:
         """What holds whatever is done with the channels hit."""
         if isinstance(estimator, Kalman | UnknownInput | Nise):
             return self._of_covariance(quiet, hit)
-        if isinstance(estimator, L1Decoder) and estimator.norm == "l1" and estimator.window.laid:
+        if isinstance(estimator, L1Decoder) and _plain_l1(estimator) and estimator.window.laid:
             weighted = estimator.weights == "noise"
             bound = of_decoder(_model(plant), estimator.window.laid, weighted, hit)
             return Promise(bound, False, "l1 ratio of the window under 1")
-        if isinstance(estimator, SecureFusion) and _plain(estimator):
+        if isinstance(estimator, SecureFusion) and _plain_fusion(estimator):
             return _of_fusion(_model(plant), estimator, hit)
         return None
 
@@ -116,8 +118,11 @@ class Promises:
             self._known[quiet] = np.sqrt(np.where(kept.any(0), mean, np.inf))
         return Promise(self._known[quiet], True, "the attack estimate has every channel hit")
 
-    def _of_stealth(self, number: int, table: dict[str, Any], hit: Hit) -> Promise | None:
-        """What a stealthy attacker reaches at most at every row, added to what noise does.
+    def _of_stealth(
+        self, number: int, quiet: int, table: dict[str, Any], hit: Hit
+    ) -> Promise | None:
+        """What a stealthy attacker reaches at most at every row, added to what noise does over
+        the run, its first rows included.
 
         None where he stops before the end: what is left of his attack then is not promised.
         """
@@ -127,15 +132,30 @@ class Promises:
         if stop <= case.steps:
             return None
         level = table.get("level", 0.01)
-        name = ("stealth", table["epsilon"], level, first, *hit.outputs.tolist())
+        name = ("stealth", quiet, table["epsilon"], level, first, *hit.outputs.tolist())
         if name not in self._known:
+            noise = self._of_covariance(quiet, _nobody(plant))
+            assert noise is not None, "nobody is hit"
             stealth = Stealth("chi_square", table["epsilon"], level, len(hit.outputs))
             system = watched(plant)
             setting = Setting(system, stealth, hit.outputs, None, np.eye(len(plant.states)))
             reached = np.zeros(case.steps)
             reached[first - 1 :] = reach(setting, case.steps - first + 1).norm
-            self._known[name] = np.sqrt(np.diagonal(system.P) + np.mean(reached**2))
+            self._known[name] = np.sqrt(noise.bound**2 + np.mean(reached**2))
         return Promise(self._known[name], False, "what a stealthy attacker reaches at most")
+
+
+def _plain_l1(estimator: L1Decoder) -> bool:
+    """Whether it minimises the l1 norm and trusts nobody beforehand."""
+    return estimator.norm == "l1" and not np.any(np.asarray(estimator.window.honest))
+
+
+def _nobody(plant: Plant) -> Hit:
+    return Hit(
+        np.zeros(len(plant.inputs), bool),
+        np.zeros(len(plant.outputs), bool),
+        np.zeros(len(plant.attacks), bool),
+    )
 
 
 def _constant(plant: Plant) -> bool:
@@ -157,7 +177,7 @@ def _of_fusion(model: Model, estimator: SecureFusion, hit: Hit) -> Promise | Non
     return Promise(of_fusion(local, estimator.gamma, hit), False, "ratio of the fusion under 1")
 
 
-def _plain(estimator: SecureFusion) -> bool:
+def _plain_fusion(estimator: SecureFusion) -> bool:
     """Whether it is the paper's: the Kalman gain, its own norm, nobody trusted or left out."""
     return estimator.kalman and estimator.plain and not estimator.refit and (
         estimator.witness is None and len(estimator.group) == len(estimator.bank.b) * len(

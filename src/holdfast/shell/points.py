@@ -115,7 +115,8 @@ def _calibrations(
         content_key(p, (str(f.threshold), str(f.calibrate)))
         for p, f in zip(parts, found, strict=True)
     ]
-    with ThreadPoolExecutor(runtime.cores()) as pool:
+    pool = ThreadPoolExecutor(runtime.cores())
+    try:
         at_work = {}
         for name, scenario in zip(names, found, strict=True):
             if name not in at_work:
@@ -125,10 +126,12 @@ def _calibrations(
             try:
                 how = at_work[name].result()[1]
             except InputError as error:
-                pool.shutdown(wait=False, cancel_futures=True)
                 raise _at_point(study, point, error) from None
             values.append(how.value if how.method in ("simulated", "log") else None)
             advance()
+    finally:
+        # an error or an interrupt does not wait for what has not begun
+        pool.shutdown(wait=False, cancel_futures=True)
     return values
 
 
