@@ -292,6 +292,17 @@ def tune(
 
 
 @app.command()
+def live(
+    config: Annotated[str, typer.Argument(help="Configuration (TOML).", show_default=False)],
+    allow_python: AllowPython = False,
+) -> None:
+    """Run the estimator on a live stream, and serve what it says."""
+    from holdfast.shell.service import serve
+
+    serve.live(config, allow_python)
+
+
+@app.command()
 def papers(
     name: Annotated[
         str | None,

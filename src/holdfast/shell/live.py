@@ -69,9 +69,20 @@ class Live:
 
     def reset(self) -> None:
         """Back to before the first row."""
-        self._flat = jnp.array(self._start)
+        self.restore(self._start[self._size :])
         self._seen = self._trusted = None
         self._views: dict[int, np.ndarray] = {}
+
+    def snapshot(self) -> np.ndarray:
+        """The state after the last row, as numbers; `restore` goes back to it."""
+        return np.asarray(self._flat)[self._size :].copy()
+
+    def restore(self, snapshot: np.ndarray) -> None:
+        """Go back to a snapshot of a `Live` of the same monitor. Raises `ValueError` else."""
+        wanted = (len(self._start) - self._size,)
+        if snapshot.shape != wanted:
+            raise ValueError(f"snapshot: found shape {snapshot.shape}, expected {wanted}")
+        self._flat = jnp.array(np.concatenate([self._start[: self._size], snapshot]))
 
     def push(self, observation: Observation) -> tuple[Estimate, Verdict]:
         """One sample: estimate and verdict, as NumPy arrays.

@@ -1,0 +1,157 @@
+"""`holdfast live`: sources to engine to sinks, in one event loop, until told to stop."""
+
+import asyncio
+import contextlib
+import math
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from holdfast import __version__
+from holdfast.shell import runtime
+from holdfast.shell.errors import InputError
+from holdfast.shell.service.building import Built, build_engine
+from holdfast.shell.service.checkpoint import read_checkpoint, write_checkpoint
+from holdfast.shell.service.config import LiveConfig, read_config
+from holdfast.shell.service.engine import Worked
+from holdfast.shell.service.episodes import event
+from holdfast.shell.service.parts import Parts, build_parts
+from holdfast.shell.service.records import Samples
+from holdfast.shell.service.sinks import Sink
+from holdfast.shell.service.sources import Source
+
+TICK = 0.05
+"""Seconds between two looks at the deadlines where none is known to come sooner."""
+SOONEST = 0.0005
+
+
+def live(path: str, allow_python: bool) -> None:
+    """Run the service that a file describes. Raises `InputError`."""
+    runtime.configure()
+    config = read_config(path)
+    built = build_engine(config, allow_python)
+    asyncio.run(Service(config, built).run())
+
+
+class Service:
+    """What holds the parts together while it runs."""
+
+    def __init__(self, config: LiveConfig, built: Built):
+        self._config, self._built, self._engine = config, built, built.engine
+        self._stop = asyncio.Event()
+        self._parts: Parts = build_parts(config, built, self._engine.ask_reset, self._stop.set)
+        self._sources: Sequence[Source] = self._parts.sources
+        self._sinks: Sequence[Sink] = self._parts.sinks
+
+    async def run(self) -> None:
+        """Until every source has ended, or a signal comes; the state is kept at the end."""
+        loop = asyncio.get_running_loop()
+        with contextlib.suppress(NotImplementedError):  # Windows has no such handlers
+            for number in (signal.SIGINT, signal.SIGTERM):
+                loop.add_signal_handler(number, self._stop.set)
+        resumed = self._resume()
+        for sink in self._sinks:
+            await sink.start()
+        self._greet(resumed)
+        tasks = [asyncio.create_task(self._sourced(source)) for source in self._sources]
+        watches = [asyncio.create_task(self._deadlines())]
+        if self._config.checkpoint is not None:
+            watches.append(asyncio.create_task(self._checkpoints(self._config.checkpoint.every)))
+        stop = asyncio.create_task(self._stop.wait())
+        try:
+            await self._until_over(tasks, watches, stop)
+        finally:
+            for task in (*tasks, *watches, stop):
+                task.cancel()
+            ended: list[asyncio.Task[Any]] = [*tasks, *watches, stop]
+            await asyncio.gather(*ended, return_exceptions=True)
+            self._checkpoint()
+            for sink in reversed(self._sinks):
+                await sink.stop()
+
+    async def _until_over(self, tasks: list, watches: list, stop: asyncio.Task) -> None:
+        over = asyncio.gather(*tasks)
+        done, _ = await asyncio.wait([over, *watches, stop], return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()  # what a part of ours raised is a fault to be seen
+        if over in done:
+            self._hand_on(self._engine.finish(), time.monotonic())
+
+    async def _sourced(self, source: Source) -> None:
+        def take(samples: Samples) -> None:
+            now = time.monotonic()
+            self._hand_on(self._engine.take(samples, now), now)
+
+        await source.run(take)
+
+    async def _deadlines(self) -> None:
+        """Close the frames that nothing completes."""
+        while True:
+            now = time.monotonic()
+            self._hand_on(self._engine.advance(now), now)
+            wait = self._engine.frames.next_deadline() - time.monotonic()
+            await asyncio.sleep(min(max(wait, SOONEST), TICK))
+
+    async def _checkpoints(self, every: float) -> None:
+        while True:
+            await asyncio.sleep(every)
+            self._checkpoint()
+
+    def _hand_on(self, worked: Worked, since: float) -> None:
+        if not worked.rows:
+            return
+        metrics = self._parts.metrics
+        if metrics is not None:
+            metrics.blind(self._engine.blind)
+        for found in worked.events:
+            for sink in self._sinks:
+                sink.event(found)
+        for row in worked.rows:
+            for sink in self._sinks:
+                sink.row(row)
+        if metrics is not None:
+            metrics.latency(time.monotonic() - since)
+
+    def _checkpoint(self) -> None:
+        keys = self._config.checkpoint
+        if keys is None:
+            return
+        # what the checkpoint calls done must be out before it
+        for sink in self._sinks:
+            sink.flush()
+        words, arrays = self._engine.held()
+        positions = {source.name: source.position for source in self._sources}
+        head = {"version": __version__, "positions": positions, "engine": words}
+        try:
+            write_checkpoint(self._config.folder / keys.file, self._built.owner, head, arrays)
+        except InputError as error:
+            print(f"warning: no checkpoint: {error}", file=sys.stderr)
+
+    def _resume(self) -> bool:
+        keys = self._config.checkpoint
+        if keys is None:
+            return False
+        found = read_checkpoint(self._config.folder / keys.file, self._built.owner)
+        if found is None:
+            return False
+        words, arrays = found
+        self._engine.restore(words["engine"], arrays)
+        for source in self._sources:
+            position = words["positions"].get(source.name)
+            if position is not None and source.position is not None:
+                source.resume(position)
+        return True
+
+    def _greet(self, resumed: bool) -> None:
+        frame = self._engine.frames.closed
+        state = "restarted" if resumed else "started"
+        reason = f"after frame {frame}" if resumed else f"holdfast {__version__}"
+        found = event(frame, math.nan, "service", "", state, reason)
+        # every start is an event of its own
+        found = found._replace(key=f"{found.key}/{time.time_ns()}")
+        for sink in self._sinks:
+            sink.event(found)
+        for line in self._parts.told:
+            print(line, file=sys.stderr)

@@ -1,0 +1,28 @@
+"""The interface of every sink."""
+
+from abc import ABC, abstractmethod
+
+from holdfast.shell.service.records import Event, Row
+
+
+class Sink(ABC):
+    """Where rows and events go. ``name`` tells it from others in events and metrics."""
+
+    name: str
+
+    async def start(self) -> None:  # noqa: B027  (most need nothing)
+        """Open what is needed. Raises `InputError` where that cannot be."""
+
+    @abstractmethod
+    def row(self, row: Row) -> None:
+        """Take a row; never waits and never raises on what happens outside."""
+
+    @abstractmethod
+    def event(self, event: Event) -> None:
+        """Take an event; the same."""
+
+    def flush(self) -> None:  # noqa: B027
+        """Make what was taken durable: called before a checkpoint says that it was."""
+
+    async def stop(self) -> None:  # noqa: B027
+        """Send on what is held, and close."""
