@@ -154,8 +154,9 @@ def _by_column(table: Table, signals: Mapping[str, str], labels: Labels) -> dict
 def _broker(table: Table, keys: Any, config: LiveConfig) -> Any:
     import ssl
 
-    from holdfast.shell.service.mqtt import Broker
+    from holdfast.shell.service.mqtt import Broker, check_package
 
+    check_package(table.file, table.key)
     password = None
     if keys.password_env or keys.password_file:
         password = secret(config.path, f"{table.key}.password", keys.password_env,

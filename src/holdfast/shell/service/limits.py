@@ -1,0 +1,36 @@
+"""Bounds on what a stream may ask of the service: how often it speaks, how soon it is called."""
+
+import random
+import time
+
+
+class RateLimit:
+    """A bucket of ``rate`` messages that fills in a second; what finds it empty is not let in."""
+
+    def __init__(self, rate: float):
+        self._rate, self._left, self._at = rate, rate, time.monotonic()
+
+    def allow(self, now: float) -> bool:
+        """Whether a message may pass at ``now`` (`time.monotonic`)."""
+        self._left = min(self._rate, self._left + self._rate * (now - self._at))
+        self._at = now
+        if self._left < 1:
+            return False
+        self._left -= 1
+        return True
+
+
+class Backoff:
+    """Pauses between attempts: from ``first`` on, each about twice as long, at most ``longest``."""
+
+    def __init__(self, first: float = 0.1, longest: float = 10.0):
+        self._first, self._longest, self._next = first, longest, first
+
+    def pause(self) -> float:
+        """Seconds until the next attempt; up to half of it is chance, so that a crowd disperses."""
+        found, self._next = self._next, min(2 * self._next, self._longest)
+        return found * random.uniform(0.5, 1.0)
+
+    def succeeded(self) -> None:
+        """Begin with short pauses again."""
+        self._next = self._first

@@ -1,0 +1,47 @@
+"""A real Mosquitto on the loopback, with a configuration of its own."""
+
+import shutil
+import socket
+import subprocess
+import time
+
+import pytest
+
+
+class Mosquitto:
+    """A broker that can be stopped and started again on the same port."""
+
+    def __init__(self, folder):
+        program = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin")
+        if program is None:
+            pytest.skip("no mosquitto: install the distribution's package of that name")
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.port = probe.getsockname()[1]
+        self._config = folder / "mosquitto.conf"
+        self._config.write_text(
+            f"listener {self.port} 127.0.0.1\nallow_anonymous true\npersistence false\n"
+            "max_queued_messages 100000\n"
+        )
+        self._program, self._running = program, None
+
+    def start(self):
+        """Start, and wait until it listens."""
+        # Mosquitto gives up root for a user that need not be able to read a test's folder
+        self._running = subprocess.Popen(
+            [self._program, "-c", str(self._config)],
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        for _ in range(500):
+            with socket.socket() as probe:
+                if probe.connect_ex(("127.0.0.1", self.port)) == 0:
+                    return self
+            time.sleep(0.01)
+        raise TimeoutError("mosquitto does not listen")
+
+    def stop(self):
+        """Stop at once."""
+        if self._running is not None:
+            self._running.kill()
+            self._running.wait()
+            self._running = None
