@@ -5,12 +5,19 @@ import json
 
 import aiomqtt
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from brokers import Mosquitto
+from holdfast.shell.service.limits import RateLimit
 from holdfast.shell.service.mqtt import Broker, MqttSink, MqttSource
 from holdfast.shell.service.records import Samples
 from holdfast.shell.service.wire import binary_decoder, binary_frame, json_decoder, single
 from live_rows import LABELS, alarm, row
+
+NAMES = st.sampled_from(["time", "trusted", "secured", "partial", "u:accel", "y:gps", "y:flow"])
+VALUES = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5)
+JSON = st.dictionaries(NAMES, VALUES | st.lists(VALUES, max_size=3), max_size=5) | VALUES
 
 
 @pytest.fixture
@@ -37,15 +44,10 @@ async def received_by(broker, topics, messages):
     source, taken = MqttSource("mqtt", Broker(port=broker.port), topics), []
     task = asyncio.create_task(source.run(taken.append))
     async with client(broker) as sender:
-        ready = asyncio.create_task(until(lambda: taken))
-        while not ready.done():  # until it has subscribed
-            await sender.publish(*messages[0])
-            await asyncio.sleep(0.02)
-        await ready
-        before = source.counters.messages
+        await until(lambda: source.connected)
         for message in messages:
             await sender.publish(*message)
-        await until(lambda: source.counters.messages >= before + len(messages))
+        await until(lambda: source.counters.messages == len(messages))
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
     return taken, source.counters
@@ -84,44 +86,68 @@ def test_rows_signals_and_rubbish(broker):
 
 def test_a_broker_that_comes_and_goes(broker):
     """Rows within the bound all arrive, in order; events are never pushed out; loss is counted."""
+    here = Broker(port=broker.port)
 
     async def play():
-        got = []
-
-        async def listen():
-            async with client(broker) as listener:
-                await listener.subscribe("drone/#", qos=1)
-                got.append("listening")
-                async for message in listener.messages:
-                    got.append((message.topic.value, json.loads(message.payload)))
-
-        sink = MqttSink("mqtt", Broker(port=broker.port), LABELS, "drone", capacity=60)
+        sink, got = MqttSink("mqtt", here, LABELS, "drone", capacity=60), []
         await sink.start()
-        listening = asyncio.create_task(listen())
-        await until(lambda: got)
         sink.row(row(1))
-        await until(lambda: len(got) == 4)
+        await until(lambda: sink.counters.messages == 3)
+        # until somebody listens, it looks for the broker where there is none
+        sink._broker = Broker(port=1)
         broker.stop()
-        await asyncio.gather(listening, return_exceptions=True)
         await until(lambda: sink.counters.disconnects)
-        got.clear()
         sink.event(alarm(2))
         for frame in range(2, 52):
             sink.row(row(frame))
         broker.start()
-        listening = asyncio.create_task(listen())
-        await until(lambda: sum(type(one) is tuple for one in got) >= 1 or not sink._rows)
+        async with client(broker) as listener:
+            await listener.subscribe("drone/#", qos=1)
+            sink._broker = here
+            async with asyncio.timeout(10):
+                async for message in listener.messages:
+                    got.append((message.topic.value, json.loads(message.payload)["frame"]))
+                    if len(got) == 61:
+                        break
         await sink.stop()
-        listening.cancel()
-        await asyncio.gather(listening, return_exceptions=True)
         return got, sink.counters
 
     got, counters = asyncio.run(play())
-    # 50 rows are 150 messages; 60 were held
+    # 50 rows are 150 messages; 60 were held, and an event
     assert counters.lost == 90
     assert counters.disconnects >= 1
-    frames = [content["frame"] for topic, content in got[1:] if topic == "drone/estimate"]
-    assert frames == sorted(frames)
+    assert counters.messages == 64
+    assert got[0] == ("drone/event/alarm", 2)
+    kinds = ("attack", "estimate", "verdict")
+    assert got[1:] == [(f"drone/{kind}", frame) for frame in range(32, 52) for kind in kinds]
+
+
+def test_the_most_specific_topic_counts():
+    topics = {"#": single("y:flow"), "one/+": single("y:gps"), "one/two": single("u:accel")}
+    source, taken = MqttSource("mqtt", Broker(), topics), []
+    for topic in ("one/two", "one/three", "three", "one/two/three"):
+        source._message(taken.append, aiomqtt.Message(topic, b"1.0", 0, False, 1, None))
+    assert [list(one.values) for one in taken] == [["u:accel"], ["y:gps"], ["y:flow"], ["y:flow"]]
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.binary(max_size=200) | JSON.map(lambda value: json.dumps(value).encode()))
+def test_no_message_does_harm(payload):
+    source, taken = MqttSource("mqtt", Broker(), {"rows": json_decoder(LABELS)}), []
+    for topic in ("rows", "other"):
+        message = aiomqtt.Message(topic, payload, 0, False, 1, None)
+        source._message(taken.append, message)
+    assert source.counters.messages == 2
+    assert source.counters.rejected + len(taken) == 2
+    assert all(set(one.values) <= set(LABELS.columns) for one in taken)
+
+
+def test_what_comes_too_fast_is_not_read():
+    source, taken = MqttSource("mqtt", Broker(), {"one": single("y:gps")}), []
+    source._limit = RateLimit(5)
+    for _ in range(10):
+        source._message(taken.append, aiomqtt.Message("one", b"1.0", 0, False, 1, None))
+    assert len(taken) == source.counters.rejected == 5
 
 
 def test_a_row_is_an_estimate_an_attack_and_a_verdict(broker):

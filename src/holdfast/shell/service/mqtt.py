@@ -4,10 +4,13 @@ import asyncio
 import contextlib
 import dataclasses
 import logging
+import socket
 import ssl
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
+from itertools import islice
 from typing import Any
 
 from holdfast.shell.errors import InputError
@@ -24,6 +27,8 @@ KEPT = 3600
 """Seconds for which a broker keeps the messages of a client that has an id and asks for qos 1."""
 EVENTS = 10_000
 """Events held while there is no broker."""
+BATCH = 10
+"""Messages of qos 0 published at once, which costs half of one after the other."""
 LAST = 2.0
 """Seconds that are taken at the end to send what is held."""
 
@@ -40,8 +45,11 @@ class Broker:
     tls: ssl.SSLContext | None = None
     qos: int = 0
 
-    def client(self, *, keep: bool) -> Any:
-        """A client of aiomqtt. ``keep``: the broker holds messages while we are away."""
+    def client(self, *, keep: bool, handle: Callable[[Any], None]) -> Any:
+        """A client of aiomqtt. ``keep``: the broker holds messages while we are away.
+
+        ``handle`` is given every message as soon as it is read.
+        """
         import aiomqtt
         from paho.mqtt.packettypes import PacketTypes
         from paho.mqtt.properties import Properties
@@ -56,8 +64,29 @@ class Broker:
             self.host, self.port, username=self.username, password=self.password,
             identifier=self.client_id, protocol=aiomqtt.ProtocolVersion.V5, keepalive=10,
             clean_start=not keep, properties=properties, tls_context=self.tls, logger=quiet,
-            max_queued_outgoing_messages=0, timeout=10.0,
+            queue_type=_direct(handle), max_queued_outgoing_messages=0, timeout=10.0,
+            # small messages one after the other must not wait for what was sent before
+            socket_options=[(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)],
         )  # fmt: skip
+
+
+def _direct(handle: Callable[[Any], None]) -> type[asyncio.Queue[Any]]:
+    """A queue in which nothing waits: to take messages out costs a task and a future each."""
+
+    class Direct(asyncio.Queue[Any]):
+        def put_nowait(self, item: Any) -> None:
+            handle(item)
+
+    return Direct
+
+
+async def _gone(client: Any) -> None:
+    """Wait until the connection breaks, which aiomqtt tells those who wait for messages.
+
+    Always raises its `MqttError`.
+    """
+    async for _ in client.messages:
+        pass
 
 
 def check_package(file: str, key: str) -> None:
@@ -69,31 +98,38 @@ def check_package(file: str, key: str) -> None:
 
 
 class MqttSource(Source):
-    """Messages of topics, each topic with what reads it."""
+    """Messages of topics, each topic with what reads it.
+
+    ``topics`` may hold wildcards; where several of them match, the most specific one counts.
+    ``connected``: whether messages come in now.
+    """
 
     def __init__(self, name: str, broker: Broker, topics: Mapping[str, Decoder]):
         self.name, self.counters = name, Counters()
-        self._broker, self._topics = broker, topics
+        self.connected = False
+        exact_first = sorted(topics, key=lambda t: ("#" in t, t.count("+"), -t.count("/")))
+        self._broker, self._topics = broker, {topic: topics[topic] for topic in exact_first}
         self._limit = RateLimit(RATE)
 
     async def run(self, take: Take) -> None:
         """Hand on messages for ever; connect again whenever the connection breaks."""
         import aiomqtt
 
-        backoff = Backoff()
+        backoff, handle = Backoff(), partial(self._message, take)
         while True:
             try:
-                async with self._broker.client(keep=True) as client:
+                async with self._broker.client(keep=True, handle=handle) as client:
                     for topic in self._topics:
                         await client.subscribe(topic, qos=self._broker.qos)
                     backoff.succeeded()
-                    async for message in client.messages:
-                        self._message(message, take)
+                    self.connected = True
+                    await _gone(client)
             except (aiomqtt.MqttError, OSError):
+                self.connected = False
                 self.counters.disconnects += 1
                 await asyncio.sleep(backoff.pause())
 
-    def _message(self, message: Any, take: Take) -> None:
+    def _message(self, take: Take, message: Any) -> None:
         self.counters.messages += 1
         payload = message.payload
         decode = self._decoder(message.topic)
@@ -177,7 +213,7 @@ class MqttSink(Sink):
         backoff = Backoff()
         while True:
             try:
-                async with self._broker.client(keep=False) as client:
+                async with self._broker.client(keep=False, handle=lambda _: None) as client:
                     backoff.succeeded()
                     await self._send_by(client)
             except (aiomqtt.MqttError, OSError):
@@ -197,20 +233,25 @@ class MqttSink(Sink):
             await asyncio.gather(watch, return_exceptions=True)
 
     async def _until_gone(self, client: Any) -> None:
-        """Wait for messages, of which there are none: it ends when the connection does."""
+        """Wait until the connection breaks, and wake the one who sends."""
         try:
-            async for _ in client.messages:
-                pass
+            await _gone(client)
         finally:
             self._waiting.set()
 
     async def _emptied(self, client: Any) -> None:
-        """Publish all that is held; a message is given up only when it is out."""
+        """Publish all that is held, events first; a message is given up only when it is out."""
         self._waiting.clear()
-        for held, qos in ((self._events, 1), (self._rows, self._broker.qos)):
-            while held:
-                message = held[0]
-                await client.publish(*message, qos=qos)
+        while held := self._events or self._rows:
+            qos = 1 if held is self._events else self._broker.qos
+            # a broker's small acknowledgements wait for each other: none of several at once
+            batch = list(islice(held, 1 if qos else BATCH))
+            found = await asyncio.gather(
+                *(client.publish(*message, qos=qos) for message in batch), return_exceptions=True
+            )
+            for message, failure in zip(batch, found, strict=True):
+                if failure is not None:
+                    raise failure
                 # a full buffer may have dropped it meanwhile
                 if held and held[0] is message:
                     held.popleft()

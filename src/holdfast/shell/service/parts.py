@@ -85,14 +85,15 @@ def build_parts(
     sources = tuple(_source(table, i, built, config) for i, table in enumerate(config.sources, 1))
     sinks = [_sink(table, i, built.labels, config, stop) for i, table in enumerate(config.sinks, 1)]
     log = None
-    if config.events is not None:
+    if config.events is not None or config.page is not None:
         from holdfast.shell.service.event_log import EventLog
 
-        log = EventLog(config.events)
+        # the page tells what happened since the start even where nothing is kept
+        log = EventLog(config.events or Path(":memory:"))
         sinks.append(log)
     metrics, told = None, ()
     if config.page is not None:
-        metrics, page, told = _page(config, built.labels, log, sources, reset)
+        metrics, page, told = _page(config, built, log, sources, reset)
         sinks += [metrics, page]
     return Parts(sources, tuple(sinks), metrics, told)
 
@@ -203,7 +204,7 @@ def _sink(
 
 
 def _page(
-    config: LiveConfig, labels: Labels, log: Any, sources: tuple[Source, ...],
+    config: LiveConfig, built: Built, log: Any, sources: tuple[Source, ...],
     reset: Callable[[], None],
 ) -> tuple[Any, Sink, tuple[str, ...]]:  # fmt: skip
     keys: Any = config.page
@@ -215,7 +216,11 @@ def _page(
     from holdfast.shell.service.metrics import Metrics
     from holdfast.shell.service.page import Page
 
-    metrics = Metrics(labels, lambda: {source.name: source.counters for source in sources})
+    labels, frames = built.labels, built.engine.frames
+    metrics = Metrics(
+        labels, lambda: {source.name: source.counters for source in sources},
+        lambda: (frames.counts, frames.clock.drift),
+    )  # fmt: skip
 
     def place(name: str | None) -> Path | None:
         return None if name is None else config.folder / name

@@ -55,29 +55,33 @@ class Service:
         for sink in self._sinks:
             await sink.start()
         self._greet(resumed)
-        tasks = [asyncio.create_task(self._sourced(source)) for source in self._sources]
-        watches = [asyncio.create_task(self._deadlines())]
+        sources = [asyncio.create_task(self._sourced(source)) for source in self._sources]
+        watches = [asyncio.create_task(self._deadlines()), asyncio.create_task(self._stop.wait())]
         if self._config.checkpoint is not None:
             watches.append(asyncio.create_task(self._checkpoints(self._config.checkpoint.every)))
-        stop = asyncio.create_task(self._stop.wait())
         try:
-            await self._until_over(tasks, watches, stop)
+            await self._until_over(sources, watches)
         finally:
-            for task in (*tasks, *watches, stop):
+            ended: list[asyncio.Task[Any]] = [*sources, *watches]
+            for task in ended:
                 task.cancel()
-            ended: list[asyncio.Task[Any]] = [*tasks, *watches, stop]
             await asyncio.gather(*ended, return_exceptions=True)
             self._checkpoint()
             for sink in reversed(self._sinks):
                 await sink.stop()
 
-    async def _until_over(self, tasks: list, watches: list, stop: asyncio.Task) -> None:
-        over = asyncio.gather(*tasks)
-        done, _ = await asyncio.wait([over, *watches, stop], return_when=asyncio.FIRST_COMPLETED)
-        for task in done:
-            task.result()  # what a part of ours raised is a fault to be seen
-        if over in done:
-            self._hand_on(self._engine.finish(), time.monotonic())
+    async def _until_over(
+        self, sources: list[asyncio.Task[None]], watches: list[asyncio.Task[Any]]
+    ) -> None:
+        """Until all sources have ended, somebody says stop, or a part of ours fails."""
+        waiting = {*sources, *watches}
+        while waiting.intersection(sources):
+            done, waiting = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()  # what a part of ours raised is a fault to be seen
+            if not done.issubset(sources):
+                return
+        self._hand_on(self._engine.finish(), time.monotonic())
 
     async def _sourced(self, source: Source) -> None:
         def take(samples: Samples) -> None:
