@@ -49,6 +49,7 @@ def test_false_alarms_above_the_target_are_no_detection():
     assert found.found[1].size is not None
 
 
+@pytest.mark.slow
 def test_what_no_size_reveals_is_said():
     """An unknown-input filter's residual is blind to the attacks it estimates."""
     watched = monitor("chi_square", "residual", "unknown_input", level=1e-4)

@@ -22,6 +22,7 @@ KINDS = {
 }
 
 
+@pytest.mark.slow
 def test_a_run_is_what_it_is_alone(tmp_path):
     scenarios = []
     for number, text in enumerate(KINDS.values()):

@@ -67,6 +67,8 @@ ESTIMATOR_SETTINGS = {
     "l1_decoder": {"window": 3},
     "l1_kalman": {"window": 3, "threshold": 5.0},
 }
+# Each compiles for half a minute; their own tests cover them in the quick tier.
+LONG = {"care", "huber", "l1_decoder", "l1_kalman", "nisme", "secure_fusion"}
 # Filters with a fixed gain: where a sensor never arrives its gain is not used, but those of the
 # others stay, and so the filter is not that of a plant without the sensor.
 FIXED_GAIN = {"decomposition", "secure_fusion"}
@@ -101,6 +103,10 @@ CONTROLLER_SETTINGS = {
 }
 
 
+def _long(kind):
+    return [pytest.mark.slow] if kind in LONG else []
+
+
 @pytest.mark.parametrize(
     ("catalog", "covered"),
     [
@@ -118,7 +124,10 @@ def test_every_entry_is_covered(catalog, covered):
 @pytest.mark.parametrize(
     ("kind", "plant"),
     # what the attacks of the plant are concerns only those that estimate them
-    [(kind, "limits" if kind == "care" else "both") for kind in ESTIMATOR_SETTINGS]
+    [
+        pytest.param(kind, "limits" if kind == "care" else "both", marks=_long(kind))
+        for kind in ESTIMATOR_SETTINGS
+    ]
     + [
         # the same code on parts of the plant above
         pytest.param("unknown_input", "actuator attack alone", marks=pytest.mark.slow),
@@ -204,7 +213,9 @@ def test_controllers(kind):
     assert np.all(np.isfinite(command))
 
 
-@pytest.mark.parametrize("kind", ESTIMATOR_SETTINGS)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=_long(kind)) for kind in ESTIMATOR_SETTINGS]
+)
 def test_live_gives_the_numbers_of_a_replay(kind):
     plant = PLANTS["both"]
     estimator = ESTIMATORS[kind](plant, X0, P0, **ESTIMATOR_SETTINGS[kind])

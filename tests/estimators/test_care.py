@@ -184,6 +184,7 @@ def test_no_bound_and_no_row():
     assert set(words(got)) == {"INFEASIBLE"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("project", "delay"), [("feedback", 0), ("output", 1), ("moments", 1)])
 def test_limits_of_what_is_undetermined_do_not_act(project, delay):
     """A cart seen by its position: the push and the speed are undetermined in their own row."""

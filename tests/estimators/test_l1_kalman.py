@@ -93,6 +93,7 @@ def test_without_a_threshold_it_filters_its_own_decoder():
     np.testing.assert_allclose((of.y - got.a)[rows], expected[rows], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_gated_samples_are_missing_samples():
     of = attacked(5)
     got = followed(build(threshold=5.0, suspects="gate"), of)[1]

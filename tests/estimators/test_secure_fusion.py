@@ -175,6 +175,7 @@ def followed_long(built, **sizes):
     return of, *followed(built, *of.all_seen)
 
 
+@pytest.mark.slow
 def test_refit_is_least_squares_on_the_others():
     """Estimate and covariance by NumPy in the paper's coordinates: to 1e-9 of the attack. The
     error in simulation has that covariance to 1.7 % (3 standard errors), and no bias: a gain

@@ -386,9 +386,9 @@ def planted(size: str, seed: int, noise: float):
     ("size", "seeds"),
     [
         ("rows", 10),
-        pytest.param("rows", 60, marks=pytest.mark.slow),
-        pytest.param("many rows", 60, marks=pytest.mark.slow),
-        pytest.param("sensors", 60, marks=pytest.mark.slow),
+        pytest.param("rows", 25, marks=pytest.mark.slow),
+        pytest.param("many rows", 25, marks=pytest.mark.slow),
+        pytest.param("sensors", 25, marks=pytest.mark.slow),
     ],
 )
 @pytest.mark.parametrize("noise", [0.0, 0.01])

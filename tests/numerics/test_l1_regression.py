@@ -379,6 +379,7 @@ def test_a_row_of_weight_zero_may_say_anything():
 # ---- side by side
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [SMALL, (30, 20)])
 def test_side_by_side_is_one_by_one(shape):
     """200 of all kinds, of which some need more rounds; n = 20 factorises by LAPACK, of which two

@@ -87,6 +87,7 @@ def test_a_place_that_cannot_be_written_is_refused_first(command, tmp_path, monk
         assert place in err
 
 
+@pytest.mark.slow
 def test_the_real_figures_show_what_the_run_says(run):
     drawn = care.figures(run)
     assert list(drawn) == ["care-figure-3", "care-figure-4", "care-figure-5"]

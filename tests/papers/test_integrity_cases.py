@@ -261,8 +261,8 @@ def scaled(run, field, by):
 
 
 def still(found):
-    """The same set at every step."""
-    return found._replace(shape=np.broadcast_to(found.shape[0], found.shape.shape))
+    """The same set at every step: the last, which has no direction without extent."""
+    return found._replace(shape=np.broadcast_to(found.shape[-1], found.shape.shape))
 
 
 def test_other_numbers_turn_the_vehicles_verdicts(tracking):

@@ -58,6 +58,7 @@ def test_map_names_are_places_not_speeds():
     assert drawing.map_pair(["north_doppler", "gps_north", "GPS-East"]) == ("GPS-East", "gps_north")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["flight", "log"])
 def test_every_figure_draws_and_is_the_same_again(kind, plant, request):
     trace = request.getfixturevalue(kind)

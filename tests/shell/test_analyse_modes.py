@@ -39,6 +39,7 @@ def test_the_field():
     }
 
 
+@pytest.mark.slow
 def test_an_assumption_that_is_not_met_is_said(tmp_path, command):
     """Of the channels that the scenario's estimator assumes attacked."""
     path = tmp_path / "still.toml"

@@ -142,6 +142,7 @@ input_weight = [[1.0]]
 """
 
 
+@pytest.mark.slow
 def test_the_control_cost_lost_is_that_of_pairs_of_runs(ran, study, monkeypatch):
     """As the documentation computes it: run by run, the same noise with the attack and without."""
     (study.parent / "scenario.toml").write_text(scenario_text(KALMAN, LQR))

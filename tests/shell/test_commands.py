@@ -69,6 +69,7 @@ def test_more_than_fits_is_refused_before_it_starts(folder):
         simulated(scenario, 10**6, 10**6, 0, "f")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [None, *(k for s in catalog.SECTIONS.values() for k in s)])
 def test_a_template_of_every_kind_loads(kind, tmp_path):
     text = scenario_text(kind)

@@ -79,6 +79,7 @@ def sd(cov):
     return np.sqrt(np.maximum(np.diagonal(cov, axis1=-2, axis2=-1), 0.0))
 
 
+@pytest.mark.slow
 def test_every_record_is_that_of_the_run_alone(study, monkeypatch):
     path = study(AXES)
     ready, store = written(path)

@@ -192,11 +192,16 @@ def with_failures(verdict: Verdict, received: Received) -> Verdict:
     """
     if not received.alarm:
         return verdict
-    reason = np.full_like(np.asarray(verdict.reason), int(Reason.FORGED))
-    return Verdict(
-        statistic=verdict.statistic,
-        threshold=verdict.threshold,
-        alarm=np.ones_like(np.asarray(verdict.alarm)),  # pyright: ignore[reportArgumentType]
-        reason=reason,  # pyright: ignore[reportArgumentType]
-        channel_alarms=verdict.channel_alarms,
+    # arrays of no dimension, also where a live step gives plain numbers
+    statistic, threshold, alarm, reason = (
+        np.asarray(value)
+        for value in (verdict.statistic, verdict.threshold, verdict.alarm, verdict.reason)
     )
+    found: Any = (
+        statistic,
+        threshold,
+        np.ones_like(alarm),
+        np.full_like(reason, int(Reason.FORGED)),
+        verdict.channel_alarms,
+    )
+    return Verdict(*found)

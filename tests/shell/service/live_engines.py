@@ -67,7 +67,7 @@ def made() -> Made:
 
 def engine(
     grace=0.0, arrival=False, refilter=0, active=True, rule="none", retry=500, rules=RULES,
-    pointed=None,
+    pointed=None, authentication=None,
 ):  # fmt: skip
     """An engine at its beginning. Engines share compiled parts: one at a time."""
     parts = made()
@@ -80,7 +80,7 @@ def engine(
     )
     fallback = Fallback(rule, 5, None if rule == "none" else parts.beside)
     frames = Frames(DT, labels.columns, grace, SourceClock(arrival, 1.0))
-    return Engine(labels, frames, estimation, fallback, refilter)
+    return Engine(labels, frames, estimation, fallback, refilter, authentication)
 
 
 def trace_of(steps=400, seed=0, attacks=()):
@@ -112,3 +112,8 @@ def played(found, messages, now=0.0):
         events += worked.events
     worked = found.finish()
     return rows + worked.rows, events + worked.events
+
+
+def states_of(rows):
+    """The states of all rows."""
+    return np.array([row.estimate.x for row in rows])

@@ -2,7 +2,7 @@
 
 Table `events` holds every event once, by its key, so that a row that is worked on again after a
 restart writes nothing twice; `acknowledgements` says who has seen which. Triggers refuse to change
-or remove a line of either.
+or remove a line of either, or to put another in its place.
 """
 
 import datetime
@@ -21,6 +21,10 @@ PENDING = 10_000
 """Events held while the file cannot be written; more are lost, and counted."""
 AT_ONCE, SOON = 256, 0.2
 """Events, or seconds since the first of them, after which they are written."""
+AGAIN = 5.0
+"""Seconds until the next attempt after one that failed: each may hold up the service."""
+OWNER = 0x48464556
+"""The application id that our files carry."""
 _COLUMNS = "id, key, frame, time, kind, subject, state, reason, statistic, threshold, written"
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS events (
@@ -30,6 +34,12 @@ CREATE TABLE IF NOT EXISTS events (
 CREATE TABLE IF NOT EXISTS acknowledgements (
     id INTEGER PRIMARY KEY AUTOINCREMENT, event INTEGER UNIQUE NOT NULL REFERENCES events(id),
     who TEXT NOT NULL, at TEXT NOT NULL);
+CREATE TRIGGER IF NOT EXISTS events_once BEFORE INSERT ON events
+    WHEN EXISTS (SELECT 1 FROM events WHERE id = NEW.id OR key = NEW.key)
+    BEGIN SELECT RAISE(IGNORE); END;
+CREATE TRIGGER IF NOT EXISTS acknowledgements_once BEFORE INSERT ON acknowledgements
+    WHEN EXISTS (SELECT 1 FROM acknowledgements WHERE id = NEW.id OR event = NEW.event)
+    BEGIN SELECT RAISE(IGNORE); END;
 CREATE TRIGGER IF NOT EXISTS events_stay BEFORE UPDATE ON events
     BEGIN SELECT RAISE(ABORT, 'the event log is only added to'); END;
 CREATE TRIGGER IF NOT EXISTS events_remain BEFORE DELETE ON events
@@ -52,20 +62,21 @@ class EventLog(Sink):
         self.name = f"events in {path.name}"
         self.trouble, self.lost = "", 0
         self._pending: deque[Event] = deque()
-        self._first = math.inf
+        self._due = math.inf
         try:
             self._base = sqlite3.connect(path, isolation_level=None)
             self._base.execute("PRAGMA busy_timeout = 200")
+            _check_owner(self._base)
             self._base.execute("PRAGMA journal_mode = WAL")
             self._base.execute("PRAGMA synchronous = FULL")
             self._base.executescript(_SCHEMA)
-            self._base.execute(f"SELECT {_COLUMNS} FROM events LIMIT 1")
+            self._base.execute(f"PRAGMA application_id = {OWNER}")
         except sqlite3.Error as error:
             raise InputError(path, "", f"no usable file ({error})", "an event log") from None
 
     def row(self, row: Row) -> None:
         """Write what has waited long enough."""
-        if time.monotonic() - self._first >= SOON:
+        if time.monotonic() >= self._due:
             self.flush()
 
     def event(self, event: Event) -> None:
@@ -74,14 +85,14 @@ class EventLog(Sink):
             self.lost += 1
             return
         if not self._pending:
-            self._first = time.monotonic()
+            self._due = time.monotonic() + SOON
         self._pending.append(event)
-        if len(self._pending) >= AT_ONCE:
+        if len(self._pending) >= AT_ONCE and not self.trouble:
             self.flush()
 
     def flush(self) -> None:
         """Write all that is held, in one transaction that is on the disk when this returns."""
-        self._first = math.inf
+        self._due = math.inf
         if not self._pending:
             return
         now = _now()
@@ -98,7 +109,7 @@ class EventLog(Sink):
                 )
         except sqlite3.Error as error:
             self.trouble = f"the event log cannot be written: {error}"
-            self._first = time.monotonic()
+            self._due = time.monotonic() + AGAIN
             return
         self._pending.clear()
         self.trouble = ""
@@ -110,7 +121,8 @@ class EventLog(Sink):
 
     def recent(self, count: int, before: int | None = None) -> list[dict[str, Any]]:
         """The newest events (those with a smaller id than ``before``), the newest first."""
-        self.flush()
+        if not self.trouble:
+            self.flush()
         found = self._base.execute(
             f"SELECT events.id, {_COLUMNS[4:]}, who, at FROM events LEFT JOIN acknowledgements "
             "ON event = events.id WHERE events.id < ? ORDER BY events.id DESC LIMIT ?",
@@ -131,7 +143,19 @@ class EventLog(Sink):
         except sqlite3.Error as error:
             self.trouble = f"the event log cannot be written: {error}"
             return False
+        self.trouble = ""
         return done.rowcount == 1
+
+
+def _check_owner(base: sqlite3.Connection) -> None:
+    """Raise `sqlite3.DatabaseError` for a file of somebody else, or one that is damaged."""
+    owner = base.execute("PRAGMA application_id").fetchone()[0]
+    empty = base.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
+    if owner != OWNER and not (owner == 0 and empty):
+        raise sqlite3.DatabaseError("a database of something else")
+    found = base.execute("PRAGMA quick_check(1)").fetchone()[0]
+    if found != "ok":
+        raise sqlite3.DatabaseError(found)
 
 
 def _read(row: dict[str, Any]) -> dict[str, Any]:

@@ -54,7 +54,7 @@ class Metrics(Sink):
             zip(residual.tolist(), variance.tolist(), row.measured, strict=True)
         ):
             self._missing[i] += seen is None
-            if 0 < spread < math.inf:
+            if 0 < spread < math.inf and math.isfinite(value):
                 square = value * value / spread
                 self._squares[i] += FORGETTING * (square - self._squares[i])
         self._last = row

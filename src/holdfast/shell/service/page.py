@@ -17,7 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from holdfast.shell.errors import InputError
+from holdfast.shell.errors import InputError, one_line
 from holdfast.shell.service.event_log import EventLog
 from holdfast.shell.service.metrics import Metrics
 from holdfast.shell.service.records import Event, Labels, Row
@@ -27,6 +27,8 @@ from holdfast.shell.service.sinks import Sink
 STATIC = Path(__file__).parent / "static"
 KEPT, EVERY = 1200, 0.05
 """Rows that a page that is opened is given, and seconds between two of them at least."""
+BATCH = 20
+"""Rows of a message to a page at most, beside the first."""
 PERIOD = 0.1
 """Seconds between two messages to a page."""
 CLIENTS, BODY, EVENTS = 32, 4096, 100
@@ -79,7 +81,6 @@ class Page(Sink):
         self._guard = Guard(token)
         self._tls = (certificate, key)
         self._rows: deque[tuple[int, Row]] = deque(maxlen=KEPT)
-        self._newest: Row | None = None
         self._count, self._told, self._at = 0, 0, 0.0
         self._look: tuple[Any, ...] = ()
         self._clients = 0
@@ -88,7 +89,6 @@ class Page(Sink):
 
     def row(self, row: Row) -> None:
         """Keep a row now and then, and every one in which something changes."""
-        self._newest = row
         now = time.monotonic()
         look = (bool(row.verdict.alarm), row.sensors, row.mode)
         if now - self._at >= EVERY or look != self._look:
@@ -102,8 +102,16 @@ class Page(Sink):
 
     async def start(self) -> None:
         """Listen. Raises `InputError` where the port cannot be had."""
-        import uvicorn
+        try:
+            import uvicorn
+            import websockets  # noqa: F401
 
+            app = self._app()
+        except ImportError:
+            raise InputError(
+                f"{self.host}:{self.port}", "", "no package for the page",
+                'pip install "holdfast[dashboard]"',
+            ) from None  # fmt: skip
         family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
         listening = socket.socket(family)
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -117,7 +125,7 @@ class Page(Sink):
         self.port = listening.getsockname()[1]
         certificate, key = self._tls
         config = uvicorn.Config(
-            self._app(), log_config=None, log_level="critical", access_log=False, lifespan="off",
+            app, log_config=None, log_level="critical", access_log=False, lifespan="off",
             ws="websockets-sansio", ws_max_size=BODY, server_header=False,
             ssl_certfile=certificate, ssl_keyfile=key,
         )  # fmt: skip
@@ -131,6 +139,11 @@ class Page(Sink):
         self._task = asyncio.create_task(self._server.serve(sockets=[listening]))
         while not self._server.started and not self._task.done():
             await asyncio.sleep(0.005)
+        if not self._server.started:
+            listening.close()
+            failed = self._task.exception()
+            raise InputError(f"{self.host}:{self.port}", "", f"no way to serve ({failed})",
+                             "a certificate and its key, as PEM files")  # fmt: skip
 
     async def stop(self) -> None:
         """Close every connection."""
@@ -196,13 +209,15 @@ class Page(Sink):
 
     def _api_events(self, request: Any, _: dict[str, Any]) -> Any:
         before = request.query_params.get("before", "")
-        return {"events": self._log.recent(EVENTS, int(before) if before.isdecimal() else None)}
+        known = before.isdecimal() and len(before) < 19  # what SQLite can hold
+        return {"events": self._log.recent(EVENTS, int(before) if known else None)}
 
     def _api_acknowledge(self, _: Any, content: dict[str, Any]) -> Any:
         number, who = content.get("id"), content.get("who")
         done = False
-        if type(number) is int and 0 < number < 2**62 and isinstance(who, str) and who.strip():
-            done = self._log.acknowledge(number, who.strip()[:100])
+        name = one_line(who).strip()[:100] if isinstance(who, str) else ""
+        if type(number) is int and 0 < number < 2**62 and name:
+            done = self._log.acknowledge(number, name)
             self._told += 1
         return {"acknowledged": done}
 
@@ -260,7 +275,7 @@ class Page(Sink):
             await asyncio.sleep(PERIOD)
             message: dict[str, Any] = {}
             if self._count != count:
-                new = [row for number, row in self._rows if number > count]
+                new = _thinned([row for number, row in self._rows if number > count])
                 count = self._count
                 message["rows"] = [row_object(row, self._labels) for row in new]
             if self._told != told:
@@ -268,3 +283,9 @@ class Page(Sink):
                 message |= self._events()
             if message:
                 await connection.send_json(message)
+
+
+def _thinned(rows: list[Row]) -> list[Row]:
+    """At most `BATCH` of them, spread evenly; the newest is always one."""
+    every = -(-len(rows) // BATCH)
+    return rows[::-1][:: max(every, 1)][::-1]

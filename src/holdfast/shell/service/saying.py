@@ -18,9 +18,10 @@ def row_object(row: Row, labels: Labels) -> dict[str, Any]:
     found: dict[str, Any] = {"frame": row.frame, "time": row.time}
     _quantities(found, "x", labels.states, estimate.x, estimate.x_cov, bool(status & _NOT_READY))
     _quantities(found, "d", labels.attacks, estimate.d, estimate.d_cov, False)
-    tested = math.isfinite(float(verdict.threshold))
-    found["statistic"] = float(verdict.statistic) if tested else None
-    found["threshold"] = float(verdict.threshold) if tested else None
+    statistic, threshold = float(verdict.statistic), float(verdict.threshold)
+    tested = math.isfinite(threshold) and math.isfinite(statistic)
+    found["statistic"] = statistic if tested else None
+    found["threshold"] = threshold if tested else None
     found["alarm"] = int(verdict.alarm)
     found["reason"] = _REASONS[int(verdict.reason)]
     found["status"] = Status(status).words

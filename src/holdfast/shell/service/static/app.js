@@ -7,7 +7,7 @@ const STATES = {
   probation: "on probation: not part of the estimate yet",
 };
 const byId = (id) => document.getElementById(id);
-const page = { token: "", rows: [], charts: [], labels: null, last: 0, wait: 500, dirty: false };
+const page = { token: "", rows: [], charts: [], labels: null, last: 0, wait: 500, lost: false, dirty: false };
 
 /* ---- the door ---- */
 
@@ -44,12 +44,14 @@ function connect() {
   socket.addEventListener("open", () => socket.send(JSON.stringify({ token: page.token })));
   socket.addEventListener("message", (message) => {
     page.wait = 500;
+    page.lost = false;
     take(JSON.parse(message.data));
   });
   socket.addEventListener("close", (closed) => {
     if (closed.code === 4401) return shut("That is not the token.");
-    if (closed.code === 4429) return shut("Too many wrong tokens, or too many pages: try again later.");
-    chip("connection", "reconnecting", "bad");
+    // 4429, too many wrong tokens or pages: others' doing, so the token is kept and tried again
+    chip("connection", closed.code === 4429 ? "refused for now, reconnecting" : "reconnecting", "bad");
+    page.lost = true;
     setTimeout(connect, page.wait);
     page.wait = Math.min(2 * page.wait, 10000);
     return undefined;
@@ -120,7 +122,7 @@ function chip(id, text, kind) {
 function draw() {
   if (page.rows.length && !byId("content").hidden) {
     const silent = (performance.now() - page.last) / 1000;
-    if (byId("connection").textContent !== "reconnecting" || silent < 1) {
+    if (!page.lost) {
       if (silent < 2) chip("connection", "● live", "good");
       else chip("connection", `no row for ${Math.round(silent)} s`, "warn");
     }
@@ -156,7 +158,16 @@ function showEvents(events) {
     const key = `${event.id}:${event.acknowledged ? event.acknowledged.who : ""}`;
     return known.get(key) || eventRow(event, key);
   });
-  byId("event-rows").replaceChildren(...rows);
+  // only what changes is moved: a button that has the focus keeps it
+  const body = byId("event-rows");
+  const kept = new Set(rows);
+  const focused = body.contains(document.activeElement);
+  for (const row of [...body.children]) if (!kept.has(row)) row.remove();
+  rows.forEach((row, i) => {
+    if (body.children[i] !== row) body.insertBefore(row, body.children[i] || null);
+  });
+  // its row has been replaced; another button would be too easily pressed by mistake
+  if (focused && !body.contains(document.activeElement)) byId("events").focus();
 }
 
 function eventRow(event, key) {

@@ -1,0 +1,168 @@
+"""The live service over a real broker on the loopback: latency, loss, rows a second.
+
+    cd benchmarks && PYTHONPATH=../src python live.py [SECONDS]
+
+A Mosquitto, `holdfast live` and this sender and listener share the machine. Latency runs from
+just before a frame is published to when its estimate has been received here.
+"""
+
+import asyncio
+import contextlib
+import json
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import aiomqtt
+import numpy as np
+
+PLANT = """\
+[plant]
+kind = "linear"
+dt = {dt}
+A = [[1.0, {dt}, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, {dt}], [0.0, 0.0, 0.0, 1.0]]
+C = {C}
+Q = [[1e-6, 0, 0, 0], [0, 1e-4, 0, 0], [0, 0, 1e-6, 0], [0, 0, 0, 1e-4]]
+R = {R}
+
+[estimator]
+kind = "kalman"
+x0 = [0, 0, 0, 0]
+P0 = [1, 1, 1, 1]
+"""
+CONFIG = """\
+scenario = "plant.toml"
+[clock]
+grace = 0.05
+[[source]]
+kind = "mqtt"
+port = {port}
+{topics}
+[[sink]]
+kind = "mqtt"
+port = {port}
+prefix = "out"
+"""
+
+
+def rows(count):
+    """Matrices of so many outputs, each one of the four states."""
+    C = np.eye(4)[np.arange(count) % 4]
+    return C.tolist(), np.diag(np.full(count, 0.25)).tolist()
+
+
+@contextlib.contextmanager
+def broker(folder):
+    """A Mosquitto, and its port."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    (folder / "broker.conf").write_text(
+        f"listener {port} 127.0.0.1\nallow_anonymous true\nset_tcp_nodelay true\n"
+        "max_queued_messages 0\n"
+    )
+    program = shutil.which("mosquitto") or "/usr/sbin/mosquitto"
+    running = subprocess.Popen([program, "-c", str(folder / "broker.conf")],
+                               stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # fmt: skip
+    try:
+        time.sleep(0.5)
+        yield port
+    finally:
+        running.kill()
+        running.wait()
+
+
+async def measure(port, rate, seconds, messages):
+    """Send ``rate`` frames a second; what came back, and how late."""
+    sent, late, stop = {}, [], asyncio.Event()
+    values = np.random.default_rng(0).normal(size=(1000, 64))
+    count = int(rate * seconds)
+
+    async def listen(ready):
+        async with aiomqtt.Client("127.0.0.1", port, max_queued_outgoing_messages=0) as client:
+            await client.subscribe("out/estimate")
+            ready.set()
+            async for message in client.messages:
+                now = time.perf_counter()
+                frame = json.loads(message.payload)
+                begun = sent.get(round(frame["time"] * rate))
+                if begun is not None:
+                    late.append(now - begun)
+                if len(late) >= count or stop.is_set():
+                    return
+
+    ready = asyncio.Event()
+    listening = asyncio.create_task(listen(ready))
+    await ready.wait()
+    async with aiomqtt.Client("127.0.0.1", port) as client:
+        await warmed(client, messages, values, rate)
+        start = time.perf_counter()
+        for k in range(count):
+            wait = start + k / rate - time.perf_counter()
+            if wait > 0:
+                await asyncio.sleep(wait)
+            number = 10 * rate + k
+            sent[number] = time.perf_counter()
+            for topic, payload in messages(number / rate, values[k % 1000]):
+                await client.publish(topic, payload)
+    stopping = asyncio.get_running_loop().call_later(5.0, stop.set)
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(6.0):
+            await listening
+    stopping.cancel()
+    return count, np.sort(late)
+
+
+async def warmed(client, messages, values, rate):
+    """Frames until the service has surely subscribed and compiled."""
+    for k in range(3 * rate):
+        for topic, payload in messages(7 + k / rate, values[0]):
+            await client.publish(topic, payload)
+        await asyncio.sleep(1 / rate)
+
+
+def case(name, rate, seconds, outputs, messages, topics):
+    """Run one case and print its line."""
+    with tempfile.TemporaryDirectory() as place, broker(Path(place)) as port:
+        folder = Path(place)
+        C, R = rows(outputs)
+        (folder / "plant.toml").write_text(PLANT.format(dt=1 / rate, C=C, R=R))
+        (folder / "live.toml").write_text(CONFIG.format(port=port, topics=topics))
+        holdfast = Path(sys.executable).with_name("holdfast")
+        running = subprocess.Popen([holdfast, "live", folder / "live.toml"])
+        try:
+            time.sleep(20)
+            count, late = asyncio.run(measure(port, rate, seconds, messages))
+        finally:
+            running.terminate()
+            running.wait()
+    p50, p99 = (1e3 * late[int(q * (len(late) - 1))] for q in (0.5, 0.99))
+    print(f"{name}: {count} frames sent, {count - len(late)} lost, "
+          f"p50 {p50:.2f} ms, p99 {p99:.2f} ms, largest {1e3 * late[-1]:.1f} ms", flush=True)  # fmt: skip
+
+
+def main():
+    """The two cases of the issue."""
+    seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 60.0
+
+    def whole(stamp, values):
+        return [("in", json.dumps({"time": stamp, **{f"y:y{i + 1}": values[i] for i in range(4)}}))]
+
+    def single(stamp, values):
+        return [
+            (f"in/{i + 1}", json.dumps({"time": stamp, "value": values[i]})) for i in range(20)
+        ]
+
+    case("1,000 frames a second, n = 4, one message each", 1000, seconds, 4, whole,
+         'topic = "in"')  # fmt: skip
+    signals = "\n".join(f'"in/{i + 1}" = "y:y{i + 1}"' for i in range(20))
+    case("100 frames a second, n = 4, 20 signals a message each", 100, seconds, 20, single,
+         f"[source.signals]\n{signals}")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
