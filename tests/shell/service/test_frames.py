@@ -176,6 +176,19 @@ def test_a_period_that_is_not_quite_dt_loses_no_frame():
     assert found.counts.empty == found.counts.late == 0
 
 
+def test_a_path_that_becomes_slower_is_followed():
+    """Half a second more from one row on: late for two seconds, and no longer."""
+    found = frames(arrival=True, grace=0.05)
+    late = []
+    for k in range(1, 201):
+        now = 0.1 * k + (0.5 if k > 100 else 0.0)
+        if found.take(row(k), now) is not None:
+            late.append(k)
+        drain(found, now)
+    assert all(100 < k <= 126 for k in late)
+    assert found.closed >= 198
+
+
 def test_drift_is_told():
     clock = SourceClock(True, 1.0)
     for k in range(20_000):

@@ -15,8 +15,9 @@ from typing import Any
 
 CONFIRMATIONS = 5
 """Samples that have to agree on a new time before it is believed."""
-LEAK = 1e-4
-"""Seconds a second by which the smallest difference is let grow, so that it follows a drift."""
+WINDOW = 1.0
+"""Seconds after which a smallest difference is forgotten if it is not met again (at most twice as
+many): a path that has become slower would make every sample late for ever."""
 DRIFT_AFTER = 10.0
 """Seconds that a drift is measured over before it is told."""
 
@@ -29,8 +30,9 @@ class SourceClock:
         self.newest = -math.inf
         """The newest stamp that was believed."""
         self.difference = math.inf
-        """The smallest of our clock less the stamp, let grow slowly."""
-        self._at = -math.inf
+        """The smallest of our clock less the stamp, of late."""
+        self._before, self._since, self._begun = math.inf, math.inf, -math.inf
+        """Of the window before, of this one, and when this one began."""
         self._first: tuple[float, float] | None = None
         self._drift = 0.0
 
@@ -51,10 +53,10 @@ class SourceClock:
         """Take up a stamp."""
         self.newest = max(self.newest, stamp)
         difference = now - stamp
-        if math.isfinite(self._at):
-            self.difference += LEAK * max(now - self._at, 0.0)
-        self.difference = min(self.difference, difference)
-        self._at = now
+        if now - self._begun > WINDOW:
+            self._before, self._since, self._begun = self._since, math.inf, now
+        self._since = min(self._since, difference)
+        self.difference = min(self._before, self._since)
         if self._first is None:
             self._first = (stamp, difference)
         elif stamp - self._first[0] >= DRIFT_AFTER:
@@ -67,7 +69,8 @@ class SourceClock:
 
     def forget(self) -> None:
         """Start anew, after a jump."""
-        self.newest, self.difference, self._at = -math.inf, math.inf, -math.inf
+        self.newest, self.difference = -math.inf, math.inf
+        self._before, self._since, self._begun = math.inf, math.inf, -math.inf
         self._first, self._drift = None, 0.0
 
     def held(self) -> dict[str, Any]:

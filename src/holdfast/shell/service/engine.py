@@ -114,7 +114,7 @@ class Engine:
         self._tell_silence(number, time, observation, events)
         self._tell_inert(number, time, verdict, events)
         events.extend(self._episodes.ended(number, time))
-        seen, y = np.asarray(observation.seen).tolist(), np.asarray(observation.y).tolist()
+        seen, y = observation.seen.tolist(), observation.y.tolist()
         measured = tuple(value if here else None for value, here in zip(y, seen, strict=True))
         sensors = tuple(self._estimation.health.states)
         return Row(number, time, estimate, verdict, sensors, self._fallback.mode, measured)
@@ -181,6 +181,9 @@ class Engine:
     def _tell_silence(
         self, number: int, time: float, observation: Observation, events: list[Event]
     ) -> None:
+        if observation.seen.all():
+            self._unheard[:] = 0
+            return
         self._unheard = np.where(observation.seen, 0, self._unheard + 1)
         for i in np.flatnonzero(self._unheard >= self._silent_rows):
             reason = f"no sample for {self._silent_rows * self.labels.dt:.3g} s"

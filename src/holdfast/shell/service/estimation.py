@@ -107,6 +107,9 @@ class Estimation:
         """Push what is admitted or authenticated; the squared innovations of all that came."""
         came = np.asarray(observation.seen)
         fused = came & (admitted | np.asarray(observation.trusted))
+        if (fused == came).all():
+            outcome = self._live.push(observation)
+            return outcome, fused_squares(outcome[0])
         outcome = self._live.push(
             Observation.of(observation.u, observation.y, fused, observation.trusted)
         )

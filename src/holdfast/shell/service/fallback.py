@@ -24,13 +24,14 @@ _FAILED = int(Status.DIVERGED | Status.NOT_CONVERGED)
 
 def failed(estimate: Estimate) -> str:
     """Why an estimate is not to be relied on, in words; "" where it is."""
-    status = int(estimate.status)
+    fields = vars(estimate)  # looking up a record's attributes one by one is slow
+    status = int(fields["status"])
     if status & _FAILED:
         return Status(status & _FAILED).words
     if status & int(Status.NOT_READY):
         return ""
-    spread = np.diagonal(np.asarray(estimate.x_cov))
-    return "" if np.all(np.isfinite(spread)) else "the samples do not determine the state"
+    known = np.isfinite(fields["x_cov"].diagonal()).all()
+    return "" if known else "the samples do not determine the state"
 
 
 class Fallback:

@@ -77,15 +77,15 @@ class Health:
         The sensors that are to be isolated are told as `ISOLATED` changes but not yet made so:
         `isolate` does that, once it is known which of them it is.
         """
-        came = np.flatnonzero(~np.isnan(squares))
+        came = np.flatnonzero(squares == squares)
         self._past[came, self._at[came]] = squares[came]
         self._at[came] = (self._at[came] + 1) % self.rules.window
-        over = self._past[came].mean(1) > self.threshold
         self._since[came] += 1
+        over = self._past.sum(1) > self.threshold * self.rules.window
         if not (self._troubled or over.any() or pointed.any()):
             return []
         changes = []
-        for i, is_over in zip(came.tolist(), over.tolist(), strict=True):
+        for i, is_over in zip(came.tolist(), over[came].tolist(), strict=True):
             statistic = float(self._past[i].mean())
             change = self._judged(i, is_over, statistic, bool(pointed[i]))
             if change is not None:

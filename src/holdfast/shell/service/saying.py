@@ -13,17 +13,20 @@ _REASONS = {int(reason): reason.words for reason in Reason}
 
 def row_object(row: Row, labels: Labels) -> dict[str, Any]:
     """A row: null where there is nothing to tell (not ready, undetermined, nothing to test)."""
-    estimate, verdict = row.estimate, row.verdict
-    status = int(estimate.status)
+    # looking up a record's attributes one by one is slow
+    estimate, verdict = vars(row.estimate), vars(row.verdict)
+    status = int(estimate["status"])
     found: dict[str, Any] = {"frame": row.frame, "time": row.time}
-    _quantities(found, "x", labels.states, estimate.x, estimate.x_cov, bool(status & _NOT_READY))
-    _quantities(found, "d", labels.attacks, estimate.d, estimate.d_cov, False)
-    statistic, threshold = float(verdict.statistic), float(verdict.threshold)
+    _quantities(
+        found, "x", labels.states, estimate["x"], estimate["x_cov"], bool(status & _NOT_READY)
+    )
+    _quantities(found, "d", labels.attacks, estimate["d"], estimate["d_cov"], False)
+    statistic, threshold = float(verdict["statistic"]), float(verdict["threshold"])
     tested = math.isfinite(threshold) and math.isfinite(statistic)
     found["statistic"] = statistic if tested else None
     found["threshold"] = threshold if tested else None
-    found["alarm"] = int(verdict.alarm)
-    found["reason"] = _REASONS[int(verdict.reason)]
+    found["alarm"] = int(verdict["alarm"])
+    found["reason"] = _REASONS[int(verdict["reason"])]
     found["status"] = Status(status).words
     found["mode"] = row.mode
     for name, state in zip(labels.outputs, row.sensors, strict=True):
