@@ -249,6 +249,7 @@ def _as_the_command_gives_them() -> list[Row]:
     return [Row(**row) for row in json.loads(done.stdout)]
 
 
+@pytest.mark.whole
 def test_the_page_on_the_papers_tells_the_numbers_of_the_whole_run():
     rows = {row.id: row for row in _as_the_command_gives_them()}
     assert [(id, row.verdict) for id, row in rows.items()] == [

@@ -232,6 +232,7 @@ def test_the_page_on_the_papers_tells_what_does_not_depend_on_draws(found):
     assert f"{len(found)} rows" in PAGE
 
 
+@pytest.mark.whole
 def test_the_page_on_the_papers_tells_the_numbers_of_the_whole_run(found):
     rows = {row.id: row for row in decompose.study().rows}
     assert {id: row.verdict for id, row in rows.items()} == {

@@ -358,6 +358,7 @@ REST = {
 }  # fmt: skip
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_the_whole_of_it():
     rows = by_id(studies.rows())

@@ -212,6 +212,7 @@ def test_every_computed_verdict_has_been_turned(found):
     assert set(TURNED) == {id for id, row in found.items() if row.verdict in OPPOSITE}
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_the_whole_study_has_the_same_verdicts():
     rows = [

@@ -201,6 +201,7 @@ def run():
     return drive(Amount(full=10))
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_the_demanded_figures(run):
     """Means over ten seeds as they are, no allowance."""
@@ -216,6 +217,7 @@ def test_the_demanded_figures(run):
     assert np.all(np.abs(cases.consistent(four).ours) < 3)
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_the_verdicts(run):
     rows = {row.id: row for row in cases.judged(run)}

@@ -175,6 +175,7 @@ def test_the_sum_has_no_bound_even_with_authentication():
     assert np.all(np.diff(blocks[10:]) > 0)
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_a_first_block_later_than_what_is_looked_at_from_the_start():
     """No set is kept before it, and so none may be begun at."""
@@ -190,6 +191,7 @@ def test_a_first_block_later_than_what_is_looked_at_from_the_start():
     assert found.norm[late - 1] >= early.norm[19] * (1 - 1e-9)
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_a_stable_plant_for_longer_than_can_be_written_out():
     """Beyond, a kept set takes over: the bounds go on as they were."""

@@ -137,6 +137,7 @@ def test_even_distances_never_do():
         assert greatest(held, None).value == math.inf
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_a_turning_plant_for_ever():
     setting = asked(TURNING, "chi_square")

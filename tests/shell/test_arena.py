@@ -1,6 +1,7 @@
 """`holdfast arena`: the table of cases, what was promised in it, and its packaged plants."""
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from holdfast.shell import arena
@@ -186,3 +187,13 @@ def test_every_plant_has_a_comparison_that_begins_without_attack():
             axes = {axis.name: axis for axis in study.axes}
             assert axes["attack"].values[0] == []
             assert study.settings.common_noise
+
+
+@pytest.mark.whole
+@pytest.mark.slow
+def test_a_plant_of_the_arena_whole(tmp_path):
+    found = arena.run_arena(["cruise"], tmp_path)
+    assert not (found.promise == "broken").any()
+    assert (found.promise != "").any()
+    again = arena.run_arena(["cruise"], tmp_path)
+    pd.testing.assert_frame_equal(found, again)

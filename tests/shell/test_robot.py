@@ -243,6 +243,7 @@ def bank_of(made, start):
     )  # fmt: skip
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("robot", "scales", "landmarks"),

@@ -66,6 +66,7 @@ def test_the_score_by_hand():
     assert (always.score, always.detection, always.classification) == (0.75, 1.0, 0.5)
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_the_figures_of_the_page(shared_data, monkeypatch):
     """docs/water_network.md, from the benchmark's own code."""

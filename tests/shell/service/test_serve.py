@@ -159,6 +159,11 @@ def test_lines_of_json_and_of_csv(folder):
     ('file = "log.csv"', 'file = "no.csv"', "no.csv"),
     ('scenario = "scenario.toml"', 'scenario = "none.toml"', "none.toml"),
     ("[clock]", "[[clock]]", "clock"),
+    (
+        'kind = "recorded"\nfile = "log.csv"\nspeed = 0.0',
+        'kind = "mqtt"\ntopic = "a/#/b"',
+        "source[1].topic",
+    ),
     ("[checkpoint]", '[page]\ntoken_env = "NO_SUCH"\n[checkpoint]', "page.token_env"),
     ("[checkpoint]", '[page]\n[checkpoint]', "page.token_env, page.token_file"),
 ])  # fmt: skip

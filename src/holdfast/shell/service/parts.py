@@ -174,19 +174,33 @@ def _broker(table: Table, keys: Any, config: LiveConfig) -> Any:
     )  # fmt: skip
 
 
+def _check_topic(table: Table, topic: str) -> None:
+    from aiomqtt import Wildcard
+
+    try:
+        Wildcard(topic)
+    except ValueError:
+        raise table.error(
+            "topic", shown(topic), "a topic of MQTT, wildcards as its parts"
+        ) from None
+
+
 def _mqtt_source(table: Table, name: str, labels: Labels, config: LiveConfig) -> Source:
     from holdfast.shell.service.mqtt import MqttSource
 
     keys: Any = table.checked(_MqttSourceKeys)
+    broker = _broker(table, keys, config)
     if (keys.topic is None) == (not keys.signals):
         found = "neither" if keys.topic is None else "both"
         raise table.error("topic, signals", found, "one of the two")
+    for topic in [keys.topic] if keys.topic is not None else keys.signals:
+        _check_topic(table, topic)
     if keys.topic is not None:
         decoders = {keys.topic: DECODERS[keys.format](labels, keys.trust)}
     else:
         columns = _by_column(table, keys.signals, labels)
         decoders = {topic: single(column) for column, topic in columns.items()}
-    return MqttSource(name, _broker(table, keys, config), decoders)
+    return MqttSource(name, broker, decoders)
 
 
 def _sink(
