@@ -17,7 +17,7 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     atexit.register(shutil.rmtree, _compiled, ignore_errors=True)
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _compiled
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.3"
-if not any(argument.startswith("slow") for argument in sys.argv):
+if not any(argument.startswith(("slow", "whole")) for argument in sys.argv):
     # most of the quick tier's time is compilation, which optimises little here; the slow tier
     # runs the code as users get it
     os.environ.setdefault(
