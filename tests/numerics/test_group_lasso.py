@@ -92,7 +92,7 @@ def test_the_papers_example(norm):
 @pytest.mark.slow
 @pytest.mark.parametrize("norm", ["l1", "sensor"])
 def test_the_papers_example_for_long(norm):
-    check_example(problems(fusion(papers_example(), norm), 1, 8000), every=1)
+    check_example(problems(fusion(papers_example(), norm), 1, 3000), every=2)
 
 
 def check_example(given, every):

@@ -215,7 +215,7 @@ def test_the_minimum_is_found(norm, kind):
 @pytest.mark.parametrize("norm", NORMS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_minimum_is_found_often(norm, kind):
-    gaps = np.array([check(drawn(kind, seed), norm) for seed in range(100, 400)])
+    gaps = np.array([check(drawn(kind, seed), norm) for seed in range(100, 250)])
     others = np.quantile(gaps[:, 1], [0.95, 1.0])
     print(f"gap {gaps[:, 0].max():.2g}, by the other dual {others}")
     assert gaps[:, 0].max() <= CLAIM
@@ -272,9 +272,9 @@ def test_nothing_to_choose(norm):
 @pytest.mark.parametrize("norm", NORMS)
 @pytest.mark.parametrize("size", [1.0, 1e6])
 def test_ten_sensors_over_eight_samples(norm, size):
-    """The decoder's size: three of ten sensors lie, 200 problems side by side."""
+    """The decoder's size: three of ten sensors lie, 100 problems side by side."""
     group = np.arange(80) % 10
-    all_given, x, _ = zip(*(attacked(s, size, 80, 8, group, 3) for s in range(200)), strict=True)
+    all_given, x, _ = zip(*(attacked(s, size, 80, 8, group, 3) for s in range(100)), strict=True)
     batch = Problem(*(np.stack(a) for a in zip(*all_given, strict=True)))
     found = jax.tree.map(np.asarray, compiled(norm, tuple(group.tolist()))[1](*batch))
     gap = found.gap / found.objective

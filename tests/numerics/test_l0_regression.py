@@ -419,4 +419,4 @@ def test_planted_attacks(size, seeds, noise):
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_many(kind, layout, noise):
-    swept(kind, layout, range(100, 300 if noise == 0.0 else 140), noise)
+    swept(kind, layout, range(100, 160 if noise == 0.0 else 120), noise)

@@ -107,7 +107,7 @@ def test_random_systems(seed):
 @pytest.mark.slow
 def test_twelve_states_twenty_sensors():
     """N = 240, in the coordinates of the bank: in the paper's they are pairs, not scalars."""
-    given = problems(fusion(drawn(181), "own"), 1, 120)
+    given = problems(fusion(drawn(181), "own"), 1, 40)
     assert given.of.Z.shape == (240, 228)
     for found in cold_and_warm(given):
         exact = violations(given, found.f)
@@ -119,11 +119,11 @@ def test_twelve_states_twenty_sensors():
 @pytest.mark.slow
 def test_long_streams():
     for seed in (-1, 267):
-        given = problems(fusion(papers_example() if seed < 0 else drawn(seed)), 3, 8000)
+        given = problems(fusion(papers_example() if seed < 0 else drawn(seed)), 3, 2000)
         found, _ = jax.tree.map(np.asarray, along(given.of.Z, given.w, given.c, empty(given.of.Z)))
         print(f"residual {found.residual.max():.2g}, most pivots {found.pivots.max()}")
         assert found.residual.max() <= ISSUE
-        assert violations(given, found.f)[::20].max() <= ISSUE
+        assert violations(given, found.f)[::10].max() <= ISSUE
         # the first attempt ends at its bound, or fails before, in fewer than one of a thousand
         assert found.pivots.max() < 2 * bound(given.of.Z)
         assert np.mean(found.pivots >= bound(given.of.Z)) < 1e-3

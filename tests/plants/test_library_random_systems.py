@@ -105,7 +105,7 @@ def test_feedback_recovers_some_of_what_structure_loses():
 
 @pytest.mark.slow
 def test_rates_of_success():
-    trials = 2000
+    trials = 1000
     rates = {
         "p = 10": success(designed(generator(), trials, N, 10).Phi, 32, 10),
         "p = 12": success(designed(generator(), trials, N, 12).Phi, 40, 12),

@@ -264,6 +264,7 @@ def test_a_bank_whose_switch_is_in_no_mode(folder, command):
     refused(command("run", path), ["estimator.bank", "'1-3'", "one that is in modes"])
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_a_thrown_switch_is_named_through_the_commands(folder, command, monkeypatch):
     """A line opened for 1 s: by `run`, and by `replay` of what it recorded."""
