@@ -48,6 +48,7 @@ def test_the_false_alarm_rate_is_the_level(name, on, estimator, method):
     assert f"{LEVEL:g}" in how.sentence
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "on", "estimator"), EVERY)
 def test_a_thousand_runs_of_a_thousand_rows(name, on, estimator):

@@ -69,6 +69,7 @@ ESTIMATOR_SETTINGS = {
 }
 # Each compiles for half a minute; their own tests cover them in the quick tier.
 LONG = {"care", "huber", "l1_decoder", "l1_kalman", "nisme", "secure_fusion"}
+WHOLE = [pytest.mark.slow, pytest.mark.whole]
 # Filters with a fixed gain: where a sensor never arrives its gain is not used, but those of the
 # others stay, and so the filter is not that of a plant without the sensor.
 FIXED_GAIN = {"decomposition", "secure_fusion"}
@@ -130,9 +131,9 @@ def test_every_entry_is_covered(catalog, covered):
     ]
     + [
         # the same code on parts of the plant above
-        pytest.param("unknown_input", "actuator attack alone", marks=pytest.mark.slow),
-        pytest.param("unknown_input", "sensor attack alone", marks=pytest.mark.slow),
-        pytest.param("unknown_input", "no attack", marks=pytest.mark.slow),
+        pytest.param("unknown_input", "actuator attack alone", marks=WHOLE),
+        pytest.param("unknown_input", "sensor attack alone", marks=WHOLE),
+        pytest.param("unknown_input", "no attack", marks=WHOLE),
     ],
 )
 def test_estimators(kind, plant):
@@ -148,7 +149,11 @@ def test_estimators(kind, plant):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
-    [{"refit": True, "trusted": ["wheel"]}, {"norm": "group"}, {"authenticated": ["gps", "flow"]}],
+    [
+        pytest.param({"refit": True, "trusted": ["wheel"]}, marks=WHOLE),
+        {"norm": "group"},
+        pytest.param({"authenticated": ["gps", "flow"]}, marks=WHOLE),
+    ],
     ids=["refit", "group", "authenticated"],
 )
 def test_secure_fusion_with_other_settings(settings):
@@ -161,11 +166,11 @@ def test_secure_fusion_with_other_settings(settings):
     ("kind", "settings"),
     [
         ("l1_decoder", {"norm": "l1l2", "weights": "noise"}),
-        ("l1_decoder", {"norm": "l1linf"}),
-        ("l1_decoder", {"norm": "l0", "threshold": 5.0}),
-        ("l1_decoder", {"trusted": ["wheel"]}),
+        pytest.param("l1_decoder", {"norm": "l1linf"}, marks=WHOLE),
+        pytest.param("l1_decoder", {"norm": "l0", "threshold": 5.0}, marks=WHOLE),
+        pytest.param("l1_decoder", {"trusted": ["wheel"]}, marks=WHOLE),
         ("l1_kalman", {"suspects": "gate"}),
-        ("l1_kalman", {"suspects": "inflate", "threshold": 2.0}),
+        pytest.param("l1_kalman", {"suspects": "inflate", "threshold": 2.0}, marks=WHOLE),
     ],
 )
 def test_decoders_with_other_settings(kind, settings):

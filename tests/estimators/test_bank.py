@@ -313,6 +313,7 @@ def test_a_plant_without_attack_channels_has_one_mode():
         np.testing.assert_array_equal(got.p, np.ones((20, 1)))
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_forty_modes_of_a_sensor_alone():
     """One output, six channels, 40 modes: most cannot be told apart, all keep their share."""

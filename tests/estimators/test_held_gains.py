@@ -87,7 +87,14 @@ def test_authenticated_samples_are_never_met_with_held_gains():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [3, 11])
-@pytest.mark.parametrize("tolerance", [1e-1, 1e-3, 1e-6])
+@pytest.mark.parametrize(
+    "tolerance",
+    [
+        pytest.param(1e-1, marks=pytest.mark.whole),
+        1e-3,
+        pytest.param(1e-6, marks=pytest.mark.whole),
+    ],
+)
 def test_what_holding_costs_is_within_what_is_asked(n, tolerance):
     """Estimates and probabilities, small plants and large, to the tolerance asked for."""
     plant = banks.plant_of(1, n, 5)

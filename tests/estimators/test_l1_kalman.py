@@ -188,7 +188,9 @@ def rmse(got, of: Log):
     return float(np.sqrt(np.mean((got.x - of.x)[100:] ** 2)))
 
 
-@pytest.mark.parametrize("rows", [500, pytest.param(10_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "rows", [500, pytest.param(10_000, marks=[pytest.mark.slow, pytest.mark.whole])]
+)
 def test_near_the_oracle(rows):
     """A threshold of 5: without attack within 5 % of the Kalman filter, and under one attacked
     sensor a row, three times as large as the signal, within 20 % of a filter that knows the attack.

@@ -136,7 +136,9 @@ def swinging():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", [["push"], ["push", "spoof"]])
+@pytest.mark.parametrize(
+    "mode", [["push"], pytest.param(["push", "spoof"], marks=pytest.mark.whole)]
+)
 def test_a_pendulum_follows_algorithm_1(mode):
     """h is linear, f is not: 1e-9, the size of what 30 rows make of rounding."""
     plant = swinging()
@@ -146,6 +148,7 @@ def test_a_pendulum_follows_algorithm_1(mode):
     check_algorithm_1(plant, model, mode, [1.0, 0.1], np.diag([0.1, 0.2]), u, y, 1e-9)
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_a_car_whose_steering_is_falsified_follows_algorithm_1():
     plant = bicycle.build()

@@ -1,28 +1,16 @@
 """The same step as `replay` and `simulate`, sample by sample, as fast as Python allows."""
 
 import ctypes
-import math
-from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from holdfast.loop import Monitor, monitor_step
-from holdfast.records import Estimate, Observation, Verdict, screen
+from holdfast.loop import Monitor
+from holdfast.records import Estimate, Observation, Verdict
 from holdfast.shell import runtime
-
-T = TypeVar("T")
-
-
-class _Slot(NamedTuple):
-    """Where one array of a record lies in a flat vector of floats."""
-
-    start: int
-    stop: int
-    shape: tuple[int, ...]
-    dtype: Any
+from holdfast.shell.flat import FlatMonitor
 
 
 class Live:
@@ -40,29 +28,24 @@ class Live:
         plant = monitor.estimator.plant
         self.monitor = monitor
         self._nu, self._ny = len(plant.inputs), len(plant.outputs)
-        state = (monitor.init(), jnp.zeros(self._nu))
-        self._sample = np.ones(self._nu + 3 * self._ny + 1)
-        outcome = jax.eval_shape(self._outcome, state, self._sample)[1]
-        outcome_slots, _ = _layout(outcome, 0)
-        self._size = outcome_slots[-1].stop
-        slots, tree = _layout(state, self._size)
+        flat = FlatMonitor(monitor)
+        self._sample = np.ones(flat.sample_size + 1)
+        size = self._size = flat.outcome_size
 
-        def step(flat, sample):
+        def step(both, sample):
             # XLA's CPU backend compiles a small loop as one kernel, and runs straight code
             # operation by operation, at several times the cost: hence a loop of one turn,
             # whose length the compiler cannot know.
             def turn(carry):
-                flat, sample = carry
-                after, outcome = self._outcome(_unpack(flat, slots, tree), sample)
-                return jnp.concatenate([_pack(outcome), _pack(after)]), sample.at[-1].add(-1.0)
+                both, sample = carry
+                after, outcome = flat.step(both[size:], sample[:-1])
+                return jnp.concatenate([outcome, after]), sample.at[-1].add(-1.0)
 
-            return jax.lax.while_loop(lambda carry: carry[1][-1] > 0, turn, (flat, sample))[0]
+            return jax.lax.while_loop(lambda carry: carry[1][-1] > 0, turn, (both, sample))[0]
 
         self._step = jax.jit(step, donate_argnums=0)
-        self._start = np.concatenate([np.zeros(self._size), np.asarray(_pack(state))])
-        split = len(jax.tree.leaves(outcome[0]))
-        self._estimate = _reader(outcome[0], outcome_slots[:split])
-        self._verdict = _reader(outcome[1], outcome_slots[split:])
+        self._start = np.concatenate([np.zeros(size), flat.start])
+        self._estimate, self._verdict = flat.estimate, flat.verdict
         self.reset()
         self.push(Observation.of(np.zeros(self._nu), np.zeros(self._ny)))  # compiles
         self.reset()
@@ -117,77 +100,7 @@ class Live:
             view = self._views[address] = np.frombuffer(memoryview(raw))
         return view.copy()
 
-    def _outcome(self, state, sample):
-        nu, ny = self._nu, self._ny
-        inner, u_before = state
-        observation = Observation(
-            u=sample[:nu],
-            y=sample[nu : nu + ny],
-            seen=sample[nu + ny : nu + 2 * ny] != 0,
-            trusted=sample[nu + 2 * ny : -1] != 0,
-            status=jnp.asarray(0, jnp.int32),
-        )
-        clean = screen(observation, u_before)
-        inner, outcome = monitor_step(self.monitor, inner, clean)
-        return (inner, clean.u), outcome
-
 
 def _if_constant(flags: Any) -> np.ndarray | None:
     """The array, if nobody can change it until it is seen again."""
     return flags if isinstance(flags, np.ndarray) and not flags.flags.writeable else None
-
-
-def _layout(tree: Any, start: int) -> tuple[list[_Slot], Any]:
-    leaves, structure = jax.tree.flatten(tree)
-    slots = []
-    for leaf in leaves:
-        stop = start + math.prod(leaf.shape)
-        slots.append(_Slot(start, stop, tuple(leaf.shape), np.dtype(leaf.dtype)))
-        start = stop
-    return slots, structure
-
-
-def _pack(tree: Any) -> jax.Array:
-    """Every leaf as floats in one vector; counters and flags are exact in float64."""
-    return jnp.concatenate([jnp.ravel(leaf).astype(float) for leaf in jax.tree.leaves(tree)])
-
-
-def _unpack(flat: jax.Array, slots: list[_Slot], tree: Any) -> Any:
-    leaves = [flat[s.start : s.stop].reshape(s.shape).astype(s.dtype) for s in slots]
-    return jax.tree.unflatten(tree, leaves)
-
-
-def _reader(record: T, slots: list[_Slot]) -> Callable[[np.ndarray], T]:
-    """What makes such a record of the flat result: views of it, counters and flags converted.
-
-    Built without the constructor's checks, which would cost more than the filter.
-    """
-    kind = type(record)
-    every = list(kind.__dataclass_fields__)  # type: ignore[attr-defined]
-    names = [name for name in every if getattr(record, name) is not None]
-    always: dict[str, Any] = {}
-    vectors, matrices, scalars = [], [], []
-    for name, (start, stop, shape, dtype) in zip(names, slots, strict=True):
-        if start == stop:
-            always[name] = np.zeros(shape, dtype)
-        elif not shape:
-            scalars.append((name, start, dtype.type))
-        elif len(shape) == 1:
-            vectors.append((name, slice(start, stop), dtype))
-        else:
-            matrices.append((name, slice(start, stop), shape))
-
-    def read(values: np.ndarray) -> T:
-        fields = dict.fromkeys(every)
-        fields.update(always)
-        for name, part, dtype in vectors:
-            fields[name] = values[part].astype(dtype, copy=False)
-        for name, part, shape in matrices:
-            fields[name] = values[part].reshape(shape)
-        for name, at, convert in scalars:
-            fields[name] = values[at] if convert is np.float64 else convert(values[at])
-        record = object.__new__(kind)
-        object.__setattr__(record, "__dict__", fields)
-        return record
-
-    return read

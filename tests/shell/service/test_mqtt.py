@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from brokers import Mosquitto
 from holdfast.shell.service.limits import RateLimit
-from holdfast.shell.service.mqtt import Broker, MqttSink, MqttSource
+from holdfast.shell.service.mqtt import Broker, MqttSink, MqttSource, said_of
 from holdfast.shell.service.records import Samples
 from holdfast.shell.service.wire import binary_decoder, binary_frame, json_decoder, single
 from live_rows import LABELS, alarm, row
@@ -89,7 +89,7 @@ def test_a_broker_that_comes_and_goes(broker):
     here = Broker(port=broker.port)
 
     async def play():
-        sink, got = MqttSink("mqtt", here, LABELS, "drone", capacity=60), []
+        sink, got = MqttSink("mqtt", here, said_of(LABELS), "drone", capacity=60), []
         await sink.start()
         sink.row(row(1))
         await until(lambda: sink.counters.messages == 3)
@@ -153,7 +153,7 @@ def test_what_comes_too_fast_is_not_read():
 def test_a_row_is_an_estimate_an_attack_and_a_verdict(broker):
     async def play():
         got = {}
-        sink = MqttSink("mqtt", Broker(port=broker.port), LABELS, "drone", capacity=60)
+        sink = MqttSink("mqtt", Broker(port=broker.port), said_of(LABELS), "drone", capacity=60)
         async with client(broker) as listener:
             await listener.subscribe("drone/#", qos=1)
             await sink.start()

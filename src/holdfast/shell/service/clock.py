@@ -11,7 +11,9 @@ forged stamp moves nothing.
 """
 
 import math
-from typing import Any
+from typing import Any, Generic, TypeVar
+
+T = TypeVar("T")
 
 CONFIRMATIONS = 5
 """Samples that have to agree on a new time before it is believed."""
@@ -20,6 +22,36 @@ WINDOW = 1.0
 many): a path that has become slower would make every sample late for ever."""
 DRIFT_AFTER = 10.0
 """Seconds that a drift is measured over before it is told."""
+
+
+class Aside(Generic[T]):
+    """What came with stamps that nobody expected, until `CONFIRMATIONS` in a row agree."""
+
+    def __init__(self, jump: float):
+        self._jump = jump
+        self._waiting: list[tuple[float, T]] = []
+        self.given_up = 0
+        """How many nobody confirmed."""
+
+    def put(self, stamp: float, item: T) -> list[T]:
+        """Add one that is no more than ``jump`` from the one before; all of them, if they are
+        enough to be believed.
+        """
+        if self._waiting and abs(stamp - self._waiting[-1][0]) > self._jump:
+            self.clear()
+        self._waiting.append((stamp, item))
+        return self.take() if len(self._waiting) >= CONFIRMATIONS else []
+
+    def take(self) -> list[T]:
+        """All that wait, which are believed now."""
+        found = [item for _, item in self._waiting]
+        self._waiting = []
+        return found
+
+    def clear(self) -> None:
+        """A stamp that was expected came between: those that wait are false."""
+        self.given_up += len(self._waiting)
+        self._waiting = []
 
 
 class SourceClock:

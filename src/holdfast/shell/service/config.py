@@ -72,6 +72,13 @@ class PageKeys(Strict):
     key: str | None = Field(None, description="the name of a PEM file")
 
 
+class FleetKeys(Strict):
+    """[fleet]: many plants of the scenario's model."""
+
+    most: int = Field(10_000, ge=1, le=10**7, description="a number of plants")
+    retire: float = Field(600.0, gt=0, lt=1e9, description="a number of seconds above 0")
+
+
 class LiveTables(Strict):
     """The sections of the file."""
 
@@ -82,6 +89,7 @@ class LiveTables(Strict):
     fallback: dict[str, Any] = Field({}, description="a table: [fallback]")
     checkpoint: dict[str, Any] | None = Field(None, description="a table: [checkpoint]")
     auth: dict[str, Any] | None = Field(None, description="a table: [auth]")
+    fleet: dict[str, Any] | None = Field(None, description="a table: [fleet]")
     events: str | None = Field(None, description="the name of a file for the event log (SQLite)")
     page: dict[str, Any] | None = Field(None, description="a table: [page]")
     source: list[dict[str, Any]] = Field(description="tables: [[source]]")
@@ -102,6 +110,7 @@ class LiveConfig:
     fallback: FallbackKeys
     checkpoint: CheckpointKeys | None
     auth: AuthKeys | None
+    fleet: FleetKeys | None
     events: Path | None
     page: PageKeys | None
     sources: tuple[Table, ...]
@@ -121,14 +130,29 @@ def read_config(path: str) -> LiveConfig:
 
     if not found.source:
         raise InputError(path, "source", "none", "one [[source]] or more")
+    if found.fleet is not None:
+        _check_fleet(path, found)
     return LiveConfig(
         path, source, folder, folder / found.scenario, found.name or Path(found.scenario).stem,
         section("clock", ClockKeys), section("sensors", SensorKeys),
         section("fallback", FallbackKeys), section("checkpoint", CheckpointKeys),
-        section("auth", AuthKeys), None if found.events is None else folder / found.events,
+        section("auth", AuthKeys), section("fleet", FleetKeys),
+        None if found.events is None else folder / found.events,
         section("page", PageKeys), _tables(path, "source", found.source, folder),
         _tables(path, "sink", found.sink, folder),
     )  # fmt: skip
+
+
+def _check_fleet(path: str, found: Any) -> None:
+    """A fleet has less than a plant has, and says so."""
+    refused = {"sensors": found.sensors, "auth": found.auth, "page": found.page,
+               "fallback.rule": "rule" in found.fallback, "clock.late": "late" in found.clock,
+               "clock.window": "window" in found.clock}  # fmt: skip
+    for key, value in refused.items():
+        if value:
+            raise InputError(
+                path, key, "a setting beside [fleet]", "none: a fleet has no such part"
+            )
 
 
 def _tables(path: str, key: str, tables: list[dict[str, Any]], folder: Path) -> tuple[Table, ...]:

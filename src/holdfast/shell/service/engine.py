@@ -57,6 +57,15 @@ class Engine:
         self._inert = 0
         self._reset_asked = False
 
+    @property
+    def closed(self) -> int:
+        """The number of the last frame that closed."""
+        return self.frames.closed
+
+    def next_deadline(self) -> float:
+        """Our clock's time when the next frame closes whatever comes; inf if that is not known."""
+        return self.frames.next_deadline()
+
     def take(self, samples: Samples, now: float) -> Worked:
         """Take a message; the frames that it closes."""
         late = self.frames.take(samples, now)

@@ -19,15 +19,15 @@ from holdfast.shell.live import Live
 
 Rule = Literal["kalman", "prediction", "none"]
 NORMAL = "normal"
-_FAILED = int(Status.DIVERGED | Status.NOT_CONVERGED)
+FAILED = int(Status.DIVERGED | Status.NOT_CONVERGED)
 
 
 def failed(estimate: Estimate) -> str:
     """Why an estimate is not to be relied on, in words; "" where it is."""
     fields = vars(estimate)  # looking up a record's attributes one by one is slow
     status = int(fields["status"])
-    if status & _FAILED:
-        return Status(status & _FAILED).words
+    if status & FAILED:
+        return Status(status & FAILED).words
     if status & int(Status.NOT_READY):
         return ""
     known = np.isfinite(fields["x_cov"].diagonal()).all()

@@ -12,10 +12,9 @@ stamp counts; two of the same stamp that differ are a fault, because nobody know
 
 import dataclasses
 import math
-from collections import deque
 from typing import Any, NamedTuple
 
-from holdfast.shell.service.clock import CONFIRMATIONS, SourceClock
+from holdfast.shell.service.clock import Aside, SourceClock
 from holdfast.shell.service.records import Samples
 
 PHASE = 0.01
@@ -75,7 +74,7 @@ class Frames:
         self._columns = frozenset(columns)
         self._open: dict[int, Frame] = {}
         self._started = False
-        self._aside: deque[tuple[Samples, float]] = deque()
+        self._aside: Aside[tuple[Samples, float]] = Aside(clock.jump)
 
     def take(self, samples: Samples, now: float) -> int | None:
         """Put what a message brought into its frame; the frame's number if it had closed."""
@@ -84,11 +83,12 @@ class Frames:
             stamp = self.clock.now(now)
             stamp = stamp if math.isfinite(stamp) else now
         if self.clock.far(stamp, now):
-            self._put_aside(samples._replace(time=stamp), now)
+            agreed = self._aside.put(stamp, (samples._replace(time=stamp), now))
+            self.counts.put_aside = self._aside.given_up
+            self._settle(agreed)
             return None
-        if self._aside:
-            self.counts.put_aside += len(self._aside)
-            self._aside.clear()
+        self._aside.clear()
+        self.counts.put_aside = self._aside.given_up
         return self._place(samples, stamp, now)
 
     def due(self, now: float) -> bool:
@@ -110,7 +110,7 @@ class Frames:
 
     def finish(self) -> Closed | None:
         """The next frame that anything has arrived for, when no more will come."""
-        self._settle_aside()
+        self._settle(self._aside.take())
         return self._take_out() if self._open else None
 
     def _place(self, samples: Samples, stamp: float, now: float) -> int | None:
@@ -186,20 +186,10 @@ class Frames:
         self._open = {number - shift: frame for number, frame in self._open.items()}
         self._started = True
 
-    def _put_aside(self, samples: Samples, now: float) -> None:
-        aside, jump = self._aside, self.clock.jump
-        if aside and abs(samples.time - aside[-1][0].time) > jump:
-            self.counts.put_aside += len(aside)
-            aside.clear()
-        aside.append((samples, now))
-        if len(aside) >= CONFIRMATIONS:
-            self._settle_aside()
-
-    def _settle_aside(self) -> None:
-        """Believe the samples put aside: a silence that ends, or a clock that has jumped."""
-        if not self._aside:
+    def _settle(self, waiting: list[tuple[Samples, float]]) -> None:
+        """Believe samples put aside: a silence that ends, or a clock that has jumped."""
+        if not waiting:
             return
-        waiting, self._aside = list(self._aside), deque()
         first = min(samples.time for samples, _ in waiting)
         ahead = (first - self.clock.newest) / self.dt
         silence = not self.clock.arrival and 0 < ahead <= AHEAD
@@ -233,7 +223,8 @@ class Frames:
         self.counts = Counts(**held["counts"])
         self.clock.restore(held["clock"])
         self._open = {int(number): _from_json(frame) for number, frame in held["open"].items()}
-        self._aside.clear()
+        self._aside.take()
+        self._aside.given_up = self.counts.put_aside
 
 
 def _as_json(frame: Frame) -> dict[str, Any]:

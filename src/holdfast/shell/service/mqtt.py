@@ -8,7 +8,7 @@ import socket
 import ssl
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from itertools import islice
 from typing import Any
@@ -19,7 +19,7 @@ from holdfast.shell.service.records import Event, Labels, Row
 from holdfast.shell.service.saying import dumps, event_object, row_object
 from holdfast.shell.service.sinks import Sink
 from holdfast.shell.service.sources import Counters, Source, Take
-from holdfast.shell.service.wire import LIMIT, Decoder
+from holdfast.shell.service.wire import LIMIT
 
 RATE = 50_000
 """Messages a second that are looked at; more are counted and left alone."""
@@ -98,14 +98,18 @@ def check_package(file: str, key: str) -> None:
 
 
 class MqttSource(Source):
-    """Messages of topics, each topic with what reads it.
+    """Messages of topics, each topic with what reads it; ``limit``: bytes of the longest.
 
     ``topics`` may hold wildcards; where several of them match, the most specific one counts.
     ``connected``: whether messages come in now.
     """
 
-    def __init__(self, name: str, broker: Broker, topics: Mapping[str, Decoder]):
+    def __init__(
+        self, name: str, broker: Broker, topics: Mapping[str, Callable[[bytes], Any]],
+        limit: int = LIMIT,
+    ):  # fmt: skip
         self.name, self.counters = name, Counters()
+        self._longest = limit
         self.connected = False
         exact_first = sorted(topics, key=lambda t: ("#" in t, t.count("+"), -t.count("/")))
         self._broker, self._topics = broker, {topic: topics[topic] for topic in exact_first}
@@ -134,52 +138,68 @@ class MqttSource(Source):
         payload = message.payload
         decode = self._decoder(message.topic)
         samples = None
-        if isinstance(payload, bytes) and len(payload) <= LIMIT and decode is not None:
+        if isinstance(payload, bytes) and len(payload) <= self._longest and decode is not None:
             samples = decode(payload) if self._limit.allow(time.monotonic()) else None
         if samples is None:
             self.counters.rejected += 1
         else:
             take(samples)
 
-    def _decoder(self, topic: Any) -> Decoder | None:
+    def _decoder(self, topic: Any) -> Callable[[bytes], Any] | None:
         found = self._topics.get(topic.value)
         if found is not None:
             return found
         return next((d for pattern, d in self._topics.items() if topic.matches(pattern)), None)
 
 
+Said = Callable[[Any], Iterable[tuple[str, bytes]]]
+"""Makes of a row its messages: what follows the prefix in their topics, and what they hold."""
+
+
+def said_of(labels: Labels) -> Said:
+    """Of a plant's row: estimate, attack (where one is estimated) and verdict, as JSON."""
+    attacks = tuple(name for of in labels.attacks for name in (f"d:{of}", f"d_sd:{of}"))
+
+    def said(row: Row) -> Iterable[tuple[str, bytes]]:
+        found = row_object(row, labels)
+        judged = {name: found.pop(name) for name in _JUDGED}
+        place = {"frame": row.frame, "time": row.time}
+        if attacks:
+            yield "attack", dumps(place | {name: found.pop(name) for name in attacks})
+        yield "estimate", dumps(found)
+        yield "verdict", dumps(place | judged)
+
+    return said
+
+
 class MqttSink(Sink):
-    """PREFIX/estimate, PREFIX/attack, PREFIX/verdict for every row, PREFIX/event/KIND.
+    """What ``said`` makes of every row, under PREFIX/, and PREFIX/event/KIND.
 
     While there is no broker, ``capacity`` messages of rows are held, and then the oldest are
     given up and counted; events have a place of their own, which rows cannot fill.
     """
 
-    def __init__(self, name: str, broker: Broker, labels: Labels, prefix: str, capacity: int):
+    def __init__(self, name: str, broker: Broker, said: Said, prefix: str, capacity: int):
         self.name, self.counters = name, Counters()
-        self._broker, self._labels, self._prefix = broker, labels, prefix
+        self._broker, self._said, self._prefix = broker, said, prefix
         self._rows: deque[tuple[str, bytes]] = deque()
         self._events: deque[tuple[str, bytes]] = deque()
         self._capacity = capacity
         self._waiting = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
-        attack = tuple(f"d:{name}" for name in labels.attacks)
-        self._attack = frozenset((*attack, *(f"d_sd:{name}" for name in labels.attacks)))
 
     async def start(self) -> None:
         """Begin to connect; rows are taken from now on."""
         self._task = asyncio.create_task(self._send())
 
-    def row(self, row: Row) -> None:
-        """Take a row: two or three messages."""
-        found = row_object(row, self._labels)
-        judged = {name: found.pop(name) for name in _JUDGED}
-        place = {"frame": row.frame, "time": row.time}
-        if self._attack:
-            attack = {name: found.pop(name) for name in self._attack}
-            self._put("attack", place | attack)
-        self._put("estimate", found)
-        self._put("verdict", place | judged)
+    def row(self, row: Any) -> None:
+        """Take a row."""
+        for topic, message in self._said(row):
+            if len(self._rows) >= self._capacity:
+                self._rows.popleft()
+                self.counters.lost += 1
+            self._rows.append((f"{self._prefix}/{topic}", message))
+        self._waiting.set()
 
     def event(self, event: Event) -> None:
         """Take an event."""
@@ -199,13 +219,6 @@ class MqttSink(Sink):
         if self._task is not None:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
-
-    def _put(self, topic: str, content: dict[str, Any]) -> None:
-        if len(self._rows) >= self._capacity:
-            self._rows.popleft()
-            self.counters.lost += 1
-        self._rows.append((f"{self._prefix}/{topic}", dumps(content)))
-        self._waiting.set()
 
     async def _send(self) -> None:
         import aiomqtt

@@ -31,7 +31,9 @@ class _RecordedKeys(Strict):
     speed: float = Field(1.0, ge=0, lt=1e9, description="a number from 0 (at once) up")
 
 
-class _BrokerKeys(Strict):
+class BrokerKeys(Strict):
+    """Of everything that speaks to a broker."""
+
     host: str = "127.0.0.1"
     port: int = Field(1883, ge=1, lt=65536, description=PORT)
     client_id: str | None = None
@@ -42,14 +44,16 @@ class _BrokerKeys(Strict):
     qos: Literal[0, 1] = 0
 
 
-class _MqttSourceKeys(_BrokerKeys):
+class _MqttSourceKeys(BrokerKeys):
     topic: str | None = Field(None, description="the topic of whole rows")
     format: Literal["json", "binary"] = "json"
     signals: dict[str, str] = Field({}, description=SIGNALS)
     trust: bool = False
 
 
-class _MqttSinkKeys(_BrokerKeys):
+class MqttSinkKeys(BrokerKeys):
+    """Of a sink to a broker."""
+
     prefix: str = Field(description="what every topic begins with")
     capacity: int = Field(10_000, ge=1, le=10**7, description="a whole number from 1 up")
 
@@ -78,9 +82,7 @@ class Parts(NamedTuple):
     told: tuple[str, ...]
 
 
-def build_parts(
-    config: LiveConfig, built: Built, reset: Callable[[], None], stop: Callable[[], None]
-) -> Parts:
+def build_parts(config: LiveConfig, built: Built, stop: Callable[[], None]) -> Parts:
     """Everything that the configuration names. Raises `InputError`."""
     sources = tuple(_source(table, i, built, config) for i, table in enumerate(config.sources, 1))
     sinks = [_sink(table, i, built.labels, config, stop) for i, table in enumerate(config.sinks, 1)]
@@ -93,7 +95,7 @@ def build_parts(
         sinks.append(log)
     metrics, told = None, ()
     if config.page is not None:
-        metrics, page, told = _page(config, built, log, sources, reset)
+        metrics, page, told = _page(config, built, log, sources, built.engine.ask_reset)
         sinks += [metrics, page]
     return Parts(sources, tuple(sinks), metrics, told)
 
@@ -152,7 +154,8 @@ def _by_column(table: Table, signals: Mapping[str, str], labels: Labels) -> dict
     return found
 
 
-def _broker(table: Table, keys: Any, config: LiveConfig) -> Any:
+def broker_of(table: Table, keys: Any, config: LiveConfig) -> Any:
+    """The broker that `BrokerKeys` name. Raises `InputError`."""
     import ssl
 
     from holdfast.shell.service.mqtt import Broker, check_package
@@ -174,7 +177,8 @@ def _broker(table: Table, keys: Any, config: LiveConfig) -> Any:
     )  # fmt: skip
 
 
-def _check_topic(table: Table, topic: str) -> None:
+def check_topic(table: Table, topic: str) -> None:
+    """Raises `InputError` for what MQTT does not take for a topic."""
     from aiomqtt import Wildcard
 
     try:
@@ -189,12 +193,12 @@ def _mqtt_source(table: Table, name: str, labels: Labels, config: LiveConfig) ->
     from holdfast.shell.service.mqtt import MqttSource
 
     keys: Any = table.checked(_MqttSourceKeys)
-    broker = _broker(table, keys, config)
+    broker = broker_of(table, keys, config)
     if (keys.topic is None) == (not keys.signals):
         found = "neither" if keys.topic is None else "both"
         raise table.error("topic, signals", found, "one of the two")
     for topic in [keys.topic] if keys.topic is not None else keys.signals:
-        _check_topic(table, topic)
+        check_topic(table, topic)
     if keys.topic is not None:
         decoders = {keys.topic: DECODERS[keys.format](labels, keys.trust)}
     else:
@@ -211,10 +215,12 @@ def _sink(
     if kind == "stdout":
         table.checked(Strict)
         return LineSink(name, labels, stop)
-    from holdfast.shell.service.mqtt import MqttSink
+    from holdfast.shell.service.mqtt import MqttSink, said_of
 
-    keys: Any = table.checked(_MqttSinkKeys)
-    return MqttSink(name, _broker(table, keys, config), labels, keys.prefix, keys.capacity)
+    keys: Any = table.checked(MqttSinkKeys)
+    return MqttSink(
+        name, broker_of(table, keys, config), said_of(labels), keys.prefix, keys.capacity
+    )
 
 
 def _page(

@@ -6,19 +6,18 @@ import math
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 from holdfast import __version__
 from holdfast.shell import runtime
 from holdfast.shell.errors import InputError
-from holdfast.shell.service.building import Built, build_engine
+from holdfast.shell.service.building import build_engine
 from holdfast.shell.service.checkpoint import read_checkpoint, write_checkpoint
 from holdfast.shell.service.config import LiveConfig, read_config
-from holdfast.shell.service.engine import Worked
 from holdfast.shell.service.episodes import event
 from holdfast.shell.service.parts import Parts, build_parts
-from holdfast.shell.service.records import Samples
 from holdfast.shell.service.sinks import Sink
 from holdfast.shell.service.sources import Source
 
@@ -31,17 +30,28 @@ def live(path: str, allow_python: bool) -> None:
     """Run the service that a file describes. Raises `InputError`."""
     runtime.configure()
     config = read_config(path)
-    built = build_engine(config, allow_python)
-    asyncio.run(Service(config, built).run())
+    if config.fleet is None:
+        built = build_engine(config, allow_python)
+        asyncio.run(Service(config, built, partial(build_parts, config, built)).run())
+        return
+    from holdfast.shell.service.fleet.building import build_fleet, build_fleet_parts
+
+    fleet = build_fleet(config, config.fleet, allow_python)
+    asyncio.run(Service(config, fleet, partial(build_fleet_parts, config, fleet)).run())
 
 
 class Service:
-    """What holds the parts together while it runs."""
+    """What holds the parts together while it runs.
 
-    def __init__(self, config: LiveConfig, built: Built):
-        self._config, self._built, self._engine = config, built, built.engine
+    ``built``: one plant or a fleet. ``parts_of`` makes sources and sinks, given what stops us.
+    """
+
+    def __init__(
+        self, config: LiveConfig, built: Any, parts_of: Callable[[Callable[[], None]], Parts]
+    ):
+        self._config, self._owner, self._engine = config, built.owner, built.engine
         self._stop = asyncio.Event()
-        self._parts: Parts = build_parts(config, built, self._engine.ask_reset, self._stop.set)
+        self._parts = parts_of(self._stop.set)
         self._sources: Sequence[Source] = self._parts.sources
         self._sinks: Sequence[Sink] = self._parts.sinks
 
@@ -84,9 +94,9 @@ class Service:
         self._hand_on(self._engine.finish(), time.monotonic())
 
     async def _sourced(self, source: Source) -> None:
-        def take(samples: Samples) -> None:
+        def take(message: Any) -> None:
             now = time.monotonic()
-            self._hand_on(self._engine.take(samples, now), now)
+            self._hand_on(self._engine.take(message, now), now)
 
         await source.run(take)
 
@@ -95,7 +105,7 @@ class Service:
         while True:
             now = time.monotonic()
             self._hand_on(self._engine.advance(now), now)
-            wait = self._engine.frames.next_deadline() - time.monotonic()
+            wait = self._engine.next_deadline() - time.monotonic()
             await asyncio.sleep(min(max(wait, SOONEST), TICK))
 
     async def _checkpoints(self, every: float) -> None:
@@ -103,7 +113,7 @@ class Service:
             await asyncio.sleep(every)
             self._checkpoint()
 
-    def _hand_on(self, worked: Worked, since: float) -> None:
+    def _hand_on(self, worked: Any, since: float) -> None:
         if not worked.rows:
             return
         metrics = self._parts.metrics
@@ -129,7 +139,7 @@ class Service:
         positions = {source.name: source.position for source in self._sources}
         head = {"version": __version__, "positions": positions, "engine": words}
         try:
-            write_checkpoint(self._config.folder / keys.file, self._built.owner, head, arrays)
+            write_checkpoint(self._config.folder / keys.file, self._owner, head, arrays)
         except InputError as error:
             print(f"warning: no checkpoint: {error}", file=sys.stderr)
 
@@ -137,7 +147,7 @@ class Service:
         keys = self._config.checkpoint
         if keys is None:
             return False
-        found = read_checkpoint(self._config.folder / keys.file, self._built.owner)
+        found = read_checkpoint(self._config.folder / keys.file, self._owner)
         if found is None:
             return False
         words, arrays = found
@@ -149,7 +159,7 @@ class Service:
         return True
 
     def _greet(self, resumed: bool) -> None:
-        frame = self._engine.frames.closed
+        frame = self._engine.closed
         state = "restarted" if resumed else "started"
         reason = f"after frame {frame}" if resumed else f"holdfast {__version__}"
         found = event(frame, math.nan, "service", "", state, reason)
