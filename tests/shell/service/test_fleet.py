@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from holdfast.loop import replay
 from holdfast.records import Observation, Status
+from holdfast.shell.flat import FlatMonitor
 from holdfast.shell.service.clock import SourceClock
 from holdfast.shell.service.fleet.engine import FleetEngine
 from holdfast.shell.service.fleet.members import Members
@@ -36,10 +37,10 @@ def engine(most=MOST, arrival=False, retire=10**6, after=5, monitor=MONITOR):
     """A fleet at its beginning; those of `MOST` share compiled parts: one at a time."""
     if monitor is MONITOR and most <= MOST:
         if not _stepping:
-            _stepping.append(Stepping(MONITOR, MOST))
+            _stepping.append(Stepping(FlatMonitor(MONITOR), MOST))
         stepping = _stepping[0]
     else:
-        stepping = Stepping(monitor, most)
+        stepping = Stepping(FlatMonitor(monitor), most)
     timing = Timing(DT, 0.0, SourceClock(arrival, 1.0))
     return FleetEngine(LABELS, stepping, timing, Members(most), after, retire)
 

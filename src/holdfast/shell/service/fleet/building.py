@@ -12,6 +12,7 @@ from pydantic import Field
 
 from holdfast.shell.calibrating import calibrated_scenario
 from holdfast.shell.errors import InputError
+from holdfast.shell.flat import FlatMonitor
 from holdfast.shell.scenario import read_scenario
 from holdfast.shell.schema import Table
 from holdfast.shell.service.checkpoint import digest
@@ -59,10 +60,10 @@ def build_fleet(config: LiveConfig, keys: FleetKeys, allow_python: bool) -> Buil
     monitor = calibrated_scenario(found)[0].monitor
     plant = monitor.estimator.plant
     labels = Labels.of(config.name, plant, monitor.estimator.init()[1])
-    stepping = Stepping(monitor, keys.most)
-    size = keys.most * len(stepping.flat.start) * 8
+    flat = FlatMonitor(monitor)
+    size = keys.most * flat.start.nbytes
     if size > MOST_BYTES:
-        most = MOST_BYTES // (len(stepping.flat.start) * 8)
+        most = MOST_BYTES // flat.start.nbytes
         raise InputError(
             config.path, "fleet.most", f"{keys.most}, which takes {size / 2**30:.1f} GiB",
             f"{most} plants or fewer",
@@ -71,7 +72,7 @@ def build_fleet(config: LiveConfig, keys: FleetKeys, allow_python: bool) -> Buil
     timing = Timing(plant.dt, clock.grace, SourceClock(clock.rule == "arrival", clock.jump))
     retire = math.ceil(keys.retire / plant.dt)
     engine = FleetEngine(
-        labels, stepping, timing, Members(keys.most), config.fallback.after, retire
+        labels, Stepping(flat, keys.most), timing, Members(keys.most), config.fallback.after, retire
     )
     return BuiltFleet(engine, labels, digest(found.source, config.source_text))
 

@@ -1,10 +1,11 @@
 """The monitor's step for any number of plants at once."""
 
+from collections.abc import Iterator
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from holdfast.loop import Monitor
 from holdfast.shell.flat import FlatMonitor
 
 BLOCK = 512
@@ -17,10 +18,8 @@ class Stepping:
     Compiled once, for blocks of a fixed size: how many plants a message has changes nothing.
     """
 
-    def __init__(self, monitor: Monitor, most: int):
-        self.flat = FlatMonitor(monitor)
-        self._most = most
-        flat = self.flat
+    def __init__(self, flat: FlatMonitor, most: int):
+        self.flat, self._most = flat, most
 
         def block(states, places, samples):
             # the last block's empty rows lie beyond the end: read as the last, written nowhere
@@ -28,33 +27,31 @@ class Stepping:
             after, outcome = jax.vmap(flat.step)(before, samples)
             return states.at[places].set(after, mode="drop"), outcome
 
+        def put(states, places, rows):
+            return states.at[places].set(rows, mode="drop")
+
         self._block = jax.jit(block, donate_argnums=0)
+        self._put = jax.jit(put, donate_argnums=0)
         self._states = jnp.asarray(np.tile(flat.start, (most, 1)))
+        # compiles, so that no message has to wait for it
         nobody = np.full(BLOCK, most)
-        self._states, _ = self._block(
-            self._states, nobody, np.zeros((BLOCK, flat.sample_size))
-        )  # compiles
+        self._states, _ = self._block(self._states, nobody, np.zeros((BLOCK, flat.sample_size)))
+        self._states = self._put(self._states, nobody, np.zeros((BLOCK, len(flat.start))))
 
     def step(self, places: np.ndarray, samples: np.ndarray) -> np.ndarray:
         """One row of the plants at these places, no two the same: their outcomes.
 
         ``samples``: plant by u, y, seen and trusted one after the other.
         """
-        found = []
-        for first in range(0, len(places), BLOCK):
-            at, given = places[first : first + BLOCK], samples[first : first + BLOCK]
-            count = len(at)
-            if count < BLOCK:
-                at = np.concatenate([at, np.full(BLOCK - count, self._most)])
-                given = np.concatenate([given, np.zeros((BLOCK - count, given.shape[1]))])
+        found = [np.zeros((0, self.flat.outcome_size))]
+        for at, given, count in self._blocks(places, samples):
             self._states, outcome = self._block(self._states, at, given)
             found.append(np.asarray(outcome)[:count])
-        return np.concatenate(found) if found else np.zeros((0, self.flat.outcome_size))
+        return np.concatenate(found)
 
     def begin(self, places: np.ndarray) -> None:
         """These plants are before their first row."""
-        if len(places):
-            self._states = self._states.at[places].set(self.flat.start)
+        self.restore(places, np.tile(self.flat.start, (len(places), 1)))
 
     def held(self, places: np.ndarray) -> np.ndarray:
         """The states of these plants, as numbers."""
@@ -65,4 +62,17 @@ class Stepping:
         wanted = (len(places), len(self.flat.start))
         if states.shape != wanted:
             raise ValueError(f"states: found shape {states.shape}, expected {wanted}")
-        self._states = self._states.at[places].set(states)
+        for at, given, _ in self._blocks(places, states):
+            self._states = self._put(self._states, at, given)
+
+    def _blocks(
+        self, places: np.ndarray, rows: np.ndarray
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, int]]:
+        """Blocks of one size, the last filled up with rows for nobody, and how many are not."""
+        for first in range(0, len(places), BLOCK):
+            at, given = places[first : first + BLOCK], rows[first : first + BLOCK]
+            count = len(at)
+            if count < BLOCK:
+                at = np.concatenate([at, np.full(BLOCK - count, self._most)])
+                given = np.concatenate([given, np.zeros((BLOCK - count, given.shape[1]))])
+            yield at, given, count
