@@ -53,6 +53,17 @@ def write_checkpoint(
         os.close(folder)
 
 
+def checkpoint_words(path: Path) -> dict[str, Any] | None:
+    """The words of a checkpoint without its arrays, unchecked; None if there is none."""
+    try:
+        with path.open("rb") as file:
+            file.readline()
+            found = json.loads(file.readline(LIMIT))
+    except (OSError, ValueError):
+        return None
+    return found if isinstance(found, dict) else None
+
+
 def read_checkpoint(path: Path, owner: str) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
     """The state that was written last, None if there is none yet.
 

@@ -105,6 +105,12 @@ class SourceClock:
         self._before, self._since, self._begun = math.inf, math.inf, -math.inf
         self._first, self._drift = None, 0.0
 
+    def resume(self, now: float, elapsed: float) -> None:
+        """After `restore`: so many seconds have passed since the state was kept."""
+        if math.isfinite(self.newest):
+            self.difference = self._since = now - self.newest - elapsed
+            self._begun = now
+
     def held(self) -> dict[str, Any]:
         """What a checkpoint keeps: our clock is another one after a restart, the stamps are not."""
         return {"newest": self.newest if math.isfinite(self.newest) else None}

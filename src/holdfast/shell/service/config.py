@@ -77,6 +77,8 @@ class FleetKeys(Strict):
 
     most: int = Field(10_000, ge=1, le=10**7, description="a number of plants")
     retire: float = Field(600.0, gt=0, lt=1e9, description="a number of seconds above 0")
+    shards: int | None = Field(None, ge=1, le=10_000, description="a number of shards")
+    prefix: str | None = Field(None, description="what the topics of the group begin with")
 
 
 class LiveTables(Strict):
@@ -148,6 +150,11 @@ def _check_fleet(path: str, found: Any) -> None:
     refused = {"sensors": found.sensors, "auth": found.auth, "page": found.page,
                "fallback.rule": "rule" in found.fallback, "clock.late": "late" in found.clock,
                "clock.window": "window" in found.clock}  # fmt: skip
+    if found.fleet.get("shards") is not None:
+        if found.checkpoint is None:
+            raise InputError(path, "checkpoint", "nothing", "a file: a shard's state follows it")
+        if found.fleet.get("prefix") is None:
+            raise InputError(path, "fleet.prefix", "nothing", "a topic for the group's own words")
     for key, value in refused.items():
         if value:
             raise InputError(

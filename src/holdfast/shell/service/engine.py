@@ -15,7 +15,7 @@ from holdfast.records import Observation, Reason, Status, Verdict
 from holdfast.shell.service.episodes import Episodes, event
 from holdfast.shell.service.estimation import Estimation
 from holdfast.shell.service.fallback import Fallback
-from holdfast.shell.service.frames import Closed, Frames
+from holdfast.shell.service.frames import AHEAD, Closed, Frames
 from holdfast.shell.service.records import Event, Labels, Row, Samples
 
 if TYPE_CHECKING:  # needs the extra "auth"
@@ -238,3 +238,10 @@ class Engine:
         self._inert, self.refiltered = int(words["inert"]), int(words["refiltered"])
         if self._authentication is not None:
             self._authentication.restore(words["authentication"])
+
+    def resume(self, now: float, elapsed: float) -> None:
+        """After `restore`: the plant has gone on for so many seconds, which become rows in which
+        nothing arrived; after too many of them its clock counts as one that jumped.
+        """
+        if 0 <= elapsed <= AHEAD * self.labels.dt:
+            self.frames.clock.resume(now, elapsed)

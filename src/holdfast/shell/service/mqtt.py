@@ -45,8 +45,9 @@ class Broker:
     tls: ssl.SSLContext | None = None
     qos: int = 0
 
-    def client(self, *, keep: bool, handle: Callable[[Any], None]) -> Any:
-        """A client of aiomqtt. ``keep``: the broker holds messages while we are away.
+    def client(self, *, keep: bool, handle: Callable[[Any], None], will: Any = None) -> Any:
+        """A client of aiomqtt. ``keep``: the broker holds messages while we are away; ``will``:
+        what it says for us when we are gone.
 
         ``handle`` is given every message as soon as it is read.
         """
@@ -64,6 +65,7 @@ class Broker:
             self.host, self.port, username=self.username, password=self.password,
             identifier=self.client_id, protocol=aiomqtt.ProtocolVersion.V5, keepalive=10,
             clean_start=not keep, properties=properties, tls_context=self.tls, logger=quiet,
+            will=will,
             queue_type=_direct(handle), max_queued_outgoing_messages=0, timeout=10.0,
             # small messages one after the other must not wait for what was sent before
             socket_options=[(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)],
@@ -80,7 +82,7 @@ def _direct(handle: Callable[[Any], None]) -> type[asyncio.Queue[Any]]:
     return Direct
 
 
-async def _gone(client: Any) -> None:
+async def gone(client: Any) -> None:
     """Wait until the connection breaks, which aiomqtt tells those who wait for messages.
 
     Always raises its `MqttError`.
@@ -127,7 +129,7 @@ class MqttSource(Source):
                         await client.subscribe(topic, qos=self._broker.qos)
                     backoff.succeeded()
                     self.connected = True
-                    await _gone(client)
+                    await gone(client)
             except (aiomqtt.MqttError, OSError):
                 self.connected = False
                 self.counters.disconnects += 1
@@ -248,7 +250,7 @@ class MqttSink(Sink):
     async def _until_gone(self, client: Any) -> None:
         """Wait until the connection breaks, and wake the one who sends."""
         try:
-            await _gone(client)
+            await gone(client)
         finally:
             self._waiting.set()
 

@@ -34,8 +34,16 @@ def live(path: str, allow_python: bool) -> None:
         built = build_engine(config, allow_python)
         asyncio.run(Service(config, built, partial(build_parts, config, built)).run())
         return
-    from holdfast.shell.service.fleet.building import build_fleet, build_fleet_parts
+    from holdfast.shell.service.fleet.building import (
+        build_fleet,
+        build_fleet_parts,
+        build_group,
+    )
 
+    if config.fleet.shards is not None:
+        group = build_group(config, config.fleet, config.fleet.shards, allow_python)
+        asyncio.run(group.run())
+        return
     fleet = build_fleet(config, config.fleet, allow_python)
     asyncio.run(Service(config, fleet, partial(build_fleet_parts, config, fleet)).run())
 
@@ -137,7 +145,8 @@ class Service:
             sink.flush()
         words, arrays = self._engine.held()
         positions = {source.name: source.position for source in self._sources}
-        head = {"version": __version__, "positions": positions, "engine": words}
+        head = {"version": __version__, "positions": positions, "engine": words,
+                "written": time.time()}  # fmt: skip
         try:
             write_checkpoint(self._config.folder / keys.file, self._owner, head, arrays)
         except InputError as error:
@@ -152,6 +161,9 @@ class Service:
             return False
         words, arrays = found
         self._engine.restore(words["engine"], arrays)
+        if not any(source.position is not None for source in self._sources):
+            # in a log that was played no time has passed
+            self._engine.resume(time.monotonic(), time.time() - words["written"])
         for source in self._sources:
             position = words["positions"].get(source.name)
             if position is not None and source.position is not None:

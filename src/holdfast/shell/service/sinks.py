@@ -1,8 +1,9 @@
 """The interface of every sink."""
 
 from abc import ABC, abstractmethod
+from typing import Any
 
-from holdfast.shell.service.records import Event, Row
+from holdfast.shell.service.records import Event
 
 
 class Sink(ABC):
@@ -14,8 +15,10 @@ class Sink(ABC):
         """Open what is needed. Raises `InputError` where that cannot be."""
 
     @abstractmethod
-    def row(self, row: Row) -> None:
-        """Take a row; never waits and never raises on what happens outside."""
+    def row(self, row: Any) -> None:
+        """Take a row, of a plant (`Row`) or of a fleet (`Told`); never waits, and never raises on
+        what happens outside.
+        """
 
     @abstractmethod
     def event(self, event: Event) -> None:

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, NamedTuple
@@ -11,7 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from holdfast.shell.calibrating import calibrated_scenario
-from holdfast.shell.errors import InputError
+from holdfast.shell.errors import InputError, shown
 from holdfast.shell.flat import FlatMonitor
 from holdfast.shell.scenario import read_scenario
 from holdfast.shell.schema import Table
@@ -19,6 +20,7 @@ from holdfast.shell.service.checkpoint import digest
 from holdfast.shell.service.clock import SourceClock
 from holdfast.shell.service.config import FleetKeys, LiveConfig
 from holdfast.shell.service.fleet.engine import FleetEngine
+from holdfast.shell.service.fleet.group import Group
 from holdfast.shell.service.fleet.members import Members
 from holdfast.shell.service.fleet.stepping import Stepping
 from holdfast.shell.service.fleet.timing import Timing
@@ -56,6 +58,43 @@ class BuiltFleet(NamedTuple):
 
 def build_fleet(config: LiveConfig, keys: FleetKeys, allow_python: bool) -> BuiltFleet:
     """Read the scenario, calibrate its detector, compile the step. Raises `InputError`."""
+    begin, labels, owner = _prepared(config, keys, allow_python)
+    return BuiltFleet(begin(), labels, owner)
+
+
+def build_fleet_parts(config: LiveConfig, built: BuiltFleet, stop: Callable[[], None]) -> Parts:
+    """Everything that the configuration names. Raises `InputError`."""
+    sources = tuple(
+        _source(table, i, built.labels, config) for i, table in enumerate(config.sources, 1)
+    )
+    return Parts(sources, _sinks(config, lambda: [built.engine]), None, ())
+
+
+def build_group(config: LiveConfig, keys: FleetKeys, shards: int, allow_python: bool) -> Group:
+    """One process of several that share the fleet. Raises `InputError`."""
+    begin, labels, owner = _prepared(config, keys, allow_python)
+    table, *more = config.sources
+    if more:
+        raise InputError(config.path, "source", f"{len(config.sources)} of them", "one")
+    source: Any = _checked_source(table, config)
+    if source.topic.count("{shard}") != 1:
+        raise table.error("topic", shown(source.topic), "a topic with {shard} in it")
+    # both checked with the file
+    assert config.checkpoint is not None
+    assert keys.prefix is not None
+    check_topic(table, keys.prefix)
+    at_work: list[FleetEngine] = []
+    return Group(
+        broker_of(table, source, config), source.topic, keys.prefix, shards,
+        config.folder / config.checkpoint.file, config.checkpoint.every, owner, begin,
+        batch_decoder(labels, source.trust), list(_sinks(config, lambda: at_work)), at_work,
+    )  # fmt: skip
+
+
+def _prepared(
+    config: LiveConfig, keys: FleetKeys, allow_python: bool
+) -> tuple[Callable[[], FleetEngine], Labels, str]:
+    """What makes engines that share a compiled step, their labels, and whose their state is."""
     found = read_scenario(config.scenario, allow_python=allow_python)
     monitor = calibrated_scenario(found)[0].monitor
     plant = monitor.estimator.plant
@@ -68,53 +107,48 @@ def build_fleet(config: LiveConfig, keys: FleetKeys, allow_python: bool) -> Buil
             config.path, "fleet.most", f"{keys.most}, which takes {size / 2**30:.1f} GiB",
             f"{most} plants or fewer",
         )  # fmt: skip
-    clock = config.clock
-    timing = Timing(plant.dt, clock.grace, SourceClock(clock.rule == "arrival", clock.jump))
-    retire = math.ceil(keys.retire / plant.dt)
-    engine = FleetEngine(
-        labels, Stepping(flat, keys.most), timing, Members(keys.most), config.fallback.after, retire
-    )
-    return BuiltFleet(engine, labels, digest(found.source, config.source_text))
+    clock, retire = config.clock, math.ceil(keys.retire / plant.dt)
+    stepping = Stepping(flat, keys.most)
+
+    def begin() -> FleetEngine:
+        timing = Timing(plant.dt, clock.grace, SourceClock(clock.rule == "arrival", clock.jump))
+        return FleetEngine(
+            labels, stepping.beside(), timing, Members(keys.most), config.fallback.after, retire
+        )
+
+    return begin, labels, digest(found.source, config.source_text)
 
 
-def build_fleet_parts(config: LiveConfig, built: BuiltFleet, stop: Callable[[], None]) -> Parts:
-    """Everything that the configuration names. Raises `InputError`."""
-    sources = tuple(
-        _source(table, i, built.labels, config) for i, table in enumerate(config.sources, 1)
-    )
-    sinks = [_sink(table, i, built, config) for i, table in enumerate(config.sinks, 1)]
-    if config.events is not None:
-        from holdfast.shell.service.event_log import EventLog
-
-        sinks.append(EventLog(config.events))
-    return Parts(sources, tuple(sinks), None, ())
+def _checked_source(table: Table, config: LiveConfig) -> Any:
+    table.kind(["mqtt"])
+    return table.checked(_SourceKeys)
 
 
 def _source(table: Table, number: int, labels: Labels, config: LiveConfig) -> Source:
     from holdfast.shell.service.mqtt import MqttSource
 
-    kind = table.kind(["mqtt"])
-    keys: Any = table.checked(_SourceKeys)
+    keys = _checked_source(table, config)
     broker = broker_of(table, keys, config)
     check_topic(table, keys.topic)
-    return MqttSource(
-        f"{kind}[{number}]", broker, {keys.topic: batch_decoder(labels, keys.trust)}, LIMIT
-    )
+    topics = {keys.topic: batch_decoder(labels, keys.trust)}
+    return MqttSource(f"mqtt[{number}]", broker, topics, LIMIT)
 
 
-def _sink(table: Table, number: int, built: BuiltFleet, config: LiveConfig) -> Sink:
+def _sinks(config: LiveConfig, engines: Callable[[], list[FleetEngine]]) -> tuple[Sink, ...]:
     from holdfast.shell.service.mqtt import MqttSink
 
-    kind = table.kind(["mqtt"])
-    keys: Any = table.checked(MqttSinkKeys)
-    broker = broker_of(table, keys, config)
-    return MqttSink(
-        f"{kind}[{number}]",
-        broker,
-        partial(_said, built.engine, _Due()),
-        keys.prefix,
-        keys.capacity,
-    )
+    sinks: list[Sink] = []
+    for number, table in enumerate(config.sinks, 1):
+        kind = table.kind(["mqtt"])
+        keys: Any = table.checked(MqttSinkKeys)
+        said = partial(_said, engines, _Due())
+        broker = broker_of(table, keys, config)
+        sinks.append(MqttSink(f"{kind}[{number}]", broker, said, keys.prefix, keys.capacity))
+    if config.events is not None:
+        from holdfast.shell.service.event_log import EventLog
+
+        sinks.append(EventLog(config.events))
+    return tuple(sinks)
 
 
 class _Due:
@@ -131,23 +165,24 @@ class _Due:
         return True
 
 
-def _said(engine: FleetEngine, due: _Due, told: Told) -> Iterable[tuple[str, bytes]]:
+def _said(
+    engines: Callable[[], list[FleetEngine]], due: _Due, told: Told
+) -> Iterable[tuple[str, bytes]]:
     yield "estimates", estimates_frame(told)
     if due():
-        yield "status", dumps(status_of(engine, told))
+        yield "status", dumps(status_of(engines(), told))
 
 
-def status_of(engine: FleetEngine, told: Told) -> dict[str, Any]:
+def status_of(engines: list[FleetEngine], told: Told) -> dict[str, Any]:
     """How the fleet does, in a few numbers; ``told``: its last rows."""
-    at, timing = engine.members.taken, engine.timing
-    return {
-        "frame": engine.closed,
-        "plants": len(at),
-        "alarms": int(np.sum(engine.alarms.open[at])),
-        "silent": int(np.sum(engine.silent.open[at])),
-        "blind": int(np.sum(~np.isfinite(told.threshold))),
-        **dataclasses.asdict(engine.counts),
-        "put_aside": timing.put_aside,
-        "jumps": timing.jumps,
-        "clock_drift": timing.clock.drift,
-    }
+    found: Counter[str] = Counter(plants=0, alarms=0, silent=0, put_aside=0, jumps=0)
+    for engine in engines:
+        at = engine.members.taken
+        found["plants"] += len(at)
+        found["alarms"] += int(np.sum(engine.alarms.open[at]))
+        found["silent"] += int(np.sum(engine.silent.open[at]))
+        found["put_aside"] += engine.timing.put_aside
+        found["jumps"] += engine.timing.jumps
+        found.update(dataclasses.asdict(engine.counts))
+    blind = int(np.sum(~np.isfinite(told.threshold)))
+    return {"frame": int(told.frame[0]), "shards": len(engines), "blind": blind, **found}

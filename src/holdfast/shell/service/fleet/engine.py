@@ -22,6 +22,8 @@ from holdfast.shell.service.fleet.timing import Timing
 from holdfast.shell.service.fleet.wire import Batch, Told
 from holdfast.shell.service.records import Event, Labels
 
+CAUGHT_UP = 10**7
+"""Rows of plants that a silence before a restart may be made up for with."""
 SHOWN = 5
 """Plants that an event about many of them names."""
 
@@ -272,3 +274,10 @@ class FleetEngine:
         self._unheard[at], self._failed[at] = arrays["unheard"], arrays["failed"]
         self.alarms.open[at], self.alarms.last[at] = arrays["alarm"], arrays["alarm_last"]
         self.silent.open[at], self.silent.last[at] = arrays["silent"], arrays["silent_last"]
+
+    def resume(self, now: float, elapsed: float) -> None:
+        """After `restore`: the plants have gone on for so many seconds, which become rows in which
+        nothing arrived; after too many of them their clock counts as one that jumped.
+        """
+        if 0 <= elapsed / self.labels.dt * len(self.members) <= CAUGHT_UP:
+            self.timing.clock.resume(now, elapsed)

@@ -1,5 +1,6 @@
 """The monitor's step for any number of plants at once."""
 
+import copy
 from collections.abc import Iterator
 
 import jax
@@ -37,6 +38,12 @@ class Stepping:
         nobody = np.full(BLOCK, most)
         self._states, _ = self._block(self._states, nobody, np.zeros((BLOCK, flat.sample_size)))
         self._states = self._put(self._states, nobody, np.zeros((BLOCK, len(flat.start))))
+
+    def beside(self) -> "Stepping":
+        """As many plants more, before their first row, by the same compiled step."""
+        found = copy.copy(self)
+        found._states = jnp.asarray(np.tile(self.flat.start, (self._most, 1)))
+        return found
 
     def step(self, places: np.ndarray, samples: np.ndarray) -> np.ndarray:
         """One row of the plants at these places, no two the same: their outcomes.
