@@ -1,7 +1,6 @@
 """One set-up for all tests: 64 bits, strict promotion, run-time types, one thread."""
 
 import atexit
-import gc
 import os
 import shutil
 import sys
@@ -55,9 +54,6 @@ def pytest_configure(config):
         jaxtyping.install_import_hook("holdfast", CHECKER)
 
 
-MAPPINGS = 30_000
-"""Memory mappings from which on a worker forgets its programs: each holds some, the kernel allows
-65 530, and a compiler that gets no more ends the process."""
 LONG = 2.0
 """Seconds from which on a test may have compiled thousands of mappings' worth."""
 
@@ -79,10 +75,9 @@ def room_after_a_module():
 
 
 def forget_programs():
-    held = Path("/proc/self/maps")
-    if held.exists() and held.read_bytes().count(b"\n") > MAPPINGS:
-        jax.clear_caches()
-        gc.collect()
+    from holdfast.shell import runtime  # once its types are checked
+
+    runtime.forget_programs()
 
 
 @pytest.fixture(scope="session")

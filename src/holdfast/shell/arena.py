@@ -85,6 +85,7 @@ def run_arena(
         for ground, study in wanted:
             told(f"{ground}: {study}")
             tables.append(_ran(ground, study, None if output is None else Path(output)))
+            runtime.forget_programs()
             advance(1)
     return pd.concat(tables, ignore_index=True)
 

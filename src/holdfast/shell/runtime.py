@@ -28,6 +28,21 @@ def configure() -> Path | None:
     return folder
 
 
+MAPPINGS = 30_000
+"""Memory mappings from which on compiled programs are forgotten: each holds some, Linux allows
+65 530, and a compiler that gets no more ends the process."""
+
+
+def forget_programs() -> None:
+    """Between two pieces of work: give up compiled programs if they hold too many mappings."""
+    held = Path("/proc/self/maps")
+    if held.exists() and held.read_bytes().count(b"\n") > MAPPINGS:
+        import jax
+
+        jax.clear_caches()
+        gc.collect()
+
+
 def cores() -> int:
     """Processors that this process may use."""
     if hasattr(os, "sched_getaffinity"):

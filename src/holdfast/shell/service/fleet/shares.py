@@ -67,9 +67,9 @@ class Shares:
                 return [Action("drop", shard)]
             self.ours.add(shard)
             return [Action("begin", shard)]
-        if name and shard in self.ours:
-            # somebody said so after us
-            return [Action("drop", shard)]
+        if shard in self.ours:
+            # somebody said so after us, or gave back what he did not know to be ours by then
+            return [Action("drop" if name else "claim", shard)]
         return []
 
     def hear_offer(self, shard: int) -> list[Action]:
