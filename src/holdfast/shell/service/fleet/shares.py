@@ -59,9 +59,9 @@ class Shares:
         """Whose a shard is; "": nobody's."""
         self._owners[shard] = name
         if name == self.name:
-            if shard not in self._claimed:
-                return []
             self._claimed.discard(shard)
+            if shard in self.ours:
+                return []
             if len(self.ours) >= self.fair:
                 # others have come since
                 return [Action("drop", shard)]
