@@ -7,7 +7,7 @@ import pytest
 
 from holdfast.shell.service.episodes import event
 from live_pages import TOKEN, served
-from live_rows import alarm, row
+from live_rows import LABELS, alarm, row
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +70,13 @@ def test_an_alarm_is_seen_acknowledged_and_found_acknowledged(tmp_path, chromium
                 sink.event(event(4, 0.4, "sensor", "gps", "isolated", "innovations too large"))
             await tab.wait_for_selector("#alarm:has-text('measurements contradict the model')")
             await tab.wait_for_selector("#sensors .isolated:has-text('gps')")
+            # a row without an alarm between two with one does not take it away
+            feed(page, metrics, range(5, 9))
+            await asyncio.sleep(0.6)
+            assert not await tab.locator("#alarm").is_hidden()
+            await asyncio.sleep(0.5)
+            feed(page, metrics, [9 + max(10, round(1 / LABELS.dt))])
+            await tab.wait_for_selector("#alarm", state="hidden")
             await tab.wait_for_selector("#event-rows button")
             tab.on("dialog", lambda dialog: asyncio.ensure_future(dialog.accept("Ada")))
             # by keyboard alone

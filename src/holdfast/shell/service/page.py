@@ -163,6 +163,12 @@ class Page(Sink):
         async def health(_: Any) -> Any:
             return PlainTextResponse("ok\n", headers=HEADERS)
 
+        class Files(StaticFiles):
+            async def get_response(self, path: str, scope: Any) -> Any:
+                found = await super().get_response(path, scope)
+                found.headers.update(HEADERS)
+                return found
+
         return Starlette(
             routes=[
                 Route("/", index),
@@ -173,7 +179,7 @@ class Page(Sink):
                 Route("/api/reset", self._guarded(self._api_reset), methods=["POST"]),
                 Route("/metrics", self._guarded(self._api_metrics)),
                 WebSocketRoute("/ws", self._socket),
-                Mount("/static", StaticFiles(directory=STATIC)),
+                Mount("/static", Files(directory=STATIC)),
             ]
         )
 

@@ -119,6 +119,16 @@ function chip(id, text, kind) {
   found.hidden = false;
 }
 
+/* The last row with an alarm, as long as its event lasts: a banner that flickers is not read. */
+function lastAlarm() {
+  const hold = Math.max(10, Math.round(1 / page.labels.dt));
+  const newest = page.rows[page.rows.length - 1].frame;
+  for (let i = page.rows.length - 1; i >= 0 && newest - page.rows[i].frame < hold; i -= 1) {
+    if (page.rows[i].alarm) return page.rows[i];
+  }
+  return null;
+}
+
 function draw() {
   if (page.rows.length && !byId("content").hidden) {
     const silent = (performance.now() - page.last) / 1000;
@@ -139,7 +149,8 @@ function draw() {
       items[i].lastChild.textContent = `${SIGNS[state]} ${STATES[state]}`;
     });
     const banner = byId("alarm");
-    const text = row.alarm ? `⚠ Alarm: ${row.reason}` : "";
+    const alarmed = lastAlarm();
+    const text = alarmed ? `⚠ Alarm: ${alarmed.reason}` : "";
     if (banner.textContent !== text) banner.textContent = text;
     banner.hidden = !text;
   }
