@@ -1,6 +1,7 @@
 """Processes that share a fleet over a real broker: one is killed, and its shards live on."""
 
 import asyncio
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -54,11 +55,15 @@ class Heard:
 
     def __init__(self):
         self.owners, self.rows, self.repeated = {}, {}, 0
+        self.taken = set()
 
     def take(self, message):
         parts = message.topic.value.split("/")
         if parts[:2] == ["group", "owners"]:
             self.owners[int(parts[2])] = (message.payload or b"").decode()
+            self.taken.discard(f"shard {parts[2]}")
+        if parts[1:] == ["event", "service"]:
+            self.taken.add(json.loads(message.payload)["subject"])
         if parts[1] == "estimates":
             told = read_estimates(message.payload)
             for i, identity in enumerate(told.ids.tolist()):
@@ -72,7 +77,7 @@ class Heard:
     def shared_by(self, count):
         """Every shard is somebody's, and so many processes have some."""
         names = [self.owners.get(i, "") for i in range(SHARDS)]
-        return all(names) and len(set(names)) == count
+        return all(names) and len(set(names)) == count and len(self.taken) == SHARDS
 
 
 async def until(condition, what, seconds=60.0):
@@ -103,6 +108,7 @@ async def played(broker, folder, processes, values):
     async def listen(ready):
         async with client() as listening:
             await listening.subscribe("out/estimates")
+            await listening.subscribe("out/event/service", qos=1)
             await listening.subscribe("group/owners/+", qos=1)
             ready.set()
             async for message in listening.messages:
@@ -125,7 +131,6 @@ async def played(broker, folder, processes, values):
     start()
     async with client() as sender:
         await until(lambda: heard.shared_by(2), "two processes do not share")
-        await asyncio.sleep(0.5)
         await send(sender, range(1, 11))
         # the checkpoints hold row 10
         await asyncio.sleep(1.0)
@@ -133,11 +138,9 @@ async def played(broker, folder, processes, values):
         killed.kill()
         killed.wait()
         await until(lambda: heard.shared_by(1), "the other one has not taken all")
-        await asyncio.sleep(0.5)
         await send(sender, range(11, 21))
         start()
         await until(lambda: heard.shared_by(2), "the third has none")
-        await asyncio.sleep(0.5)
         await send(sender, range(21, 31))
     for process in processes[1:]:
         process.terminate()

@@ -60,6 +60,15 @@ class Broker:
             kind, *what = self.words[name].popleft()
             self.do(name, getattr(self.members[name], f"hear_{kind}")(*what))
 
+    def leave(self, name):
+        """A process stops in order: it hears on until its own words have come back."""
+        me = self.members[name]
+        self.do(name, me.leave())
+        while me.waiting:
+            self.step(self.rng.choice([who for who, words in self.words.items() if words]))
+        assert name not in self.owners.values()
+        self.die(name)
+
     def settle(self):
         """Until nothing is said any more, and some ticks beyond."""
         for _ in range(60):
@@ -77,7 +86,7 @@ class Broker:
 def test_every_shard_ends_with_one_owner_that_lives(first):
     for seed in range(first, first + 100):
         rng = random.Random(seed)
-        lived(rng, rng.choices("jjds", k=rng.randrange(41)))
+        lived(rng, rng.choices("jjdls", k=rng.randrange(41)))
 
 
 def lived(rng, deeds):
@@ -87,8 +96,8 @@ def lived(rng, deeds):
         if deed == "j":
             born += 1
             broker.join(f"{rng.random():.6f}-{born}")
-        elif deed == "d" and len(broker.members) > 1:
-            broker.die(rng.choice(sorted(broker.members)))
+        elif deed in "dl" and len(broker.members) > 1:
+            (broker.die if deed == "d" else broker.leave)(rng.choice(sorted(broker.members)))
         else:
             for _ in range(rng.randrange(20)):
                 broker.step(rng.choice(sorted(broker.members)))

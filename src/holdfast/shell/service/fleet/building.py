@@ -35,7 +35,7 @@ from holdfast.shell.service.parts import (
 from holdfast.shell.service.records import Labels
 from holdfast.shell.service.saying import dumps
 from holdfast.shell.service.sinks import Sink
-from holdfast.shell.service.sources import Source
+from holdfast.shell.service.sources import Counters, Source
 
 MOST_BYTES = 4 * 2**30
 """Bytes of all plants' states that are allowed."""
@@ -67,7 +67,8 @@ def build_fleet_parts(config: LiveConfig, built: BuiltFleet, stop: Callable[[], 
     sources = tuple(
         _source(table, i, built.labels, config) for i, table in enumerate(config.sources, 1)
     )
-    return Parts(sources, _sinks(config, lambda: [built.engine]), None, ())
+    counters = [source.counters for source in sources]
+    return Parts(sources, _sinks(config, [built.engine], counters), None, ())
 
 
 def build_group(config: LiveConfig, keys: FleetKeys, shards: int, allow_python: bool) -> Group:
@@ -84,10 +85,12 @@ def build_group(config: LiveConfig, keys: FleetKeys, shards: int, allow_python: 
     assert keys.prefix is not None
     check_topic(table, keys.prefix)
     at_work: list[FleetEngine] = []
+    counters = Counters()
     return Group(
         broker_of(table, source, config), source.topic, keys.prefix, shards,
         config.folder / config.checkpoint.file, config.checkpoint.every, owner, begin,
-        batch_decoder(labels, source.trust), list(_sinks(config, lambda: at_work)), at_work,
+        batch_decoder(labels, source.trust), list(_sinks(config, at_work, [counters])), at_work,
+        counters,
     )  # fmt: skip
 
 
@@ -134,14 +137,16 @@ def _source(table: Table, number: int, labels: Labels, config: LiveConfig) -> So
     return MqttSource(f"mqtt[{number}]", broker, topics, LIMIT)
 
 
-def _sinks(config: LiveConfig, engines: Callable[[], list[FleetEngine]]) -> tuple[Sink, ...]:
+def _sinks(
+    config: LiveConfig, engines: list[FleetEngine], counters: list[Counters]
+) -> tuple[Sink, ...]:
     from holdfast.shell.service.mqtt import MqttSink
 
     sinks: list[Sink] = []
     for number, table in enumerate(config.sinks, 1):
         kind = table.kind(["mqtt"])
         keys: Any = table.checked(MqttSinkKeys)
-        said = partial(_said, engines, _Due())
+        said = partial(_said, engines, counters, _Due())
         broker = broker_of(table, keys, config)
         sinks.append(MqttSink(f"{kind}[{number}]", broker, said, keys.prefix, keys.capacity))
     if config.events is not None:
@@ -166,14 +171,14 @@ class _Due:
 
 
 def _said(
-    engines: Callable[[], list[FleetEngine]], due: _Due, told: Told
+    engines: list[FleetEngine], counters: list[Counters], due: _Due, told: Told
 ) -> Iterable[tuple[str, bytes]]:
     yield "estimates", estimates_frame(told)
     if due():
-        yield "status", dumps(status_of(engines(), told))
+        yield "status", dumps(status_of(engines, counters, told))
 
 
-def status_of(engines: list[FleetEngine], told: Told) -> dict[str, Any]:
+def status_of(engines: list[FleetEngine], counters: list[Counters], told: Told) -> dict[str, Any]:
     """How the fleet does, in a few numbers; ``told``: its last rows."""
     found: Counter[str] = Counter(plants=0, alarms=0, silent=0, put_aside=0, jumps=0)
     for engine in engines:
@@ -184,5 +189,7 @@ def status_of(engines: list[FleetEngine], told: Told) -> dict[str, Any]:
         found["put_aside"] += engine.timing.put_aside
         found["jumps"] += engine.timing.jumps
         found.update(dataclasses.asdict(engine.counts))
+    for counted in counters:
+        found.update(dataclasses.asdict(counted))
     blind = int(np.sum(~np.isfinite(told.threshold)))
     return {"frame": int(told.frame[0]), "shards": len(engines), "blind": blind, **found}

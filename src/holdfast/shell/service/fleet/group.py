@@ -38,6 +38,8 @@ OFFERS = 0.5
 """Seconds between two looks at what nobody owns."""
 SETTLED = 1.0
 """Seconds after a connection by which what the broker retains has been heard."""
+LAST_WORDS = 1.0
+"""Seconds that a process waits for its own words when it leaves."""
 NOBODY = b""
 
 
@@ -75,9 +77,9 @@ class Group:
     def __init__(
         self, broker: Broker, topic: str, prefix: str, shards: int, state: Path, every: float,
         owner: str, begin: Callable[[], FleetEngine], decode: Callable[[bytes], Batch | None],
-        sinks: list[Sink], engines: list[FleetEngine],
+        sinks: list[Sink], engines: list[FleetEngine], counters: Counters,
     ):  # fmt: skip
-        self.counters = Counters()
+        self.counters = counters
         self.at_work: dict[int, Shard] = {}
         self._engines = engines
         self._broker, self._prefix, self._shards = broker, prefix, shards
@@ -164,7 +166,11 @@ class Group:
 
     async def _leave(self, client: Any, shares: Shares, here: str) -> None:
         """Keep every state, and say that it can be had."""
-        await self._do(client, shares, [Action("drop", shard) for shard in sorted(shares.ours)])
+        await self._do(client, shares, shares.leave())
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(LAST_WORDS):
+                while shares.waiting:  # what was on its way comes back through `_listen`
+                    await asyncio.sleep(TICK)
         await client.publish(here, NOBODY, qos=1, retain=True)
 
     async def _listen(
@@ -196,8 +202,9 @@ class Group:
             elif kind == "claim":
                 await client.publish(owner, shares.name.encode(), qos=1, retain=True)
             elif kind == "begin":
-                self._work_on(shard)
+                found = self._work_on(shard)
                 await client.subscribe(self._topic_of[shard], qos=self._broker.qos)
+                self._tell_taken(shard, found)
             else:
                 await client.unsubscribe(self._topic_of[shard])
                 dropped = self._gave_up(shard)
@@ -207,10 +214,13 @@ class Group:
                         self._keep(shard, was)
                     await client.publish(owner, NOBODY, qos=1, retain=True)
 
-    def _work_on(self, shard: int) -> None:
+    def _work_on(self, shard: int) -> Shard:
         path = self._state.with_name(f"{self._state.name}.{shard}")
         found = self.at_work[shard] = Shard(self._begin(), path, self._owner)
         self._engines.append(found.engine)
+        return found
+
+    def _tell_taken(self, shard: int, found: Shard) -> None:
         told = event(found.engine.closed, found.engine.timing.clock.newest, "service",
                      f"shard {shard}", "taken", f"its process number {found.turn}")  # fmt: skip
         told = told._replace(key=f"{told.key}/{found.turn}")

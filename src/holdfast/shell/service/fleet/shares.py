@@ -12,7 +12,7 @@ No network here: words go in, actions come out.
 import math
 from typing import Literal, NamedTuple
 
-AGAIN = 2.0
+AGAIN = 1.0
 """Seconds until a shard that nobody took is offered again."""
 
 
@@ -37,6 +37,7 @@ class Shares:
         self._owners: dict[int, str] = {}
         self._claimed: set[int] = set()
         self._offered: dict[int, float] = {}
+        self._leaving = False
 
     @property
     def fair(self) -> int:
@@ -62,7 +63,7 @@ class Shares:
             self._claimed.discard(shard)
             if shard in self.ours:
                 return []
-            if len(self.ours) >= self.fair:
+            if self._leaving or len(self.ours) >= self.fair:
                 # others have come since
                 return [Action("drop", shard)]
             self.ours.add(shard)
@@ -73,13 +74,24 @@ class Shares:
         return []
 
     def hear_offer(self, shard: int) -> list[Action]:
-        """The broker gave us a shard that somebody offered."""
-        if shard in self.ours or shard in self._claimed or not self._free(shard):
+        """The broker gave us a shard that somebody offered. One that we leave alone is offered
+        again, and comes to another.
+        """
+        known = shard in self.ours or shard in self._claimed or not self._free(shard)
+        if known or self._leaving or len(self.ours) + len(self._claimed) >= self.fair:
             return []
-        if len(self.ours) + len(self._claimed) >= self.fair:
-            return [Action("offer", shard)]
         self._claimed.add(shard)
         return [Action("claim", shard)]
+
+    def leave(self) -> list[Action]:
+        """Take nothing any more, and give everything back."""
+        self._leaving = True
+        return [Action("drop", shard) for shard in sorted(self.ours)]
+
+    @property
+    def waiting(self) -> bool:
+        """Whether we have claimed a shard and not heard our own word on it yet."""
+        return bool(self._claimed)
 
     def owns(self, shard: int) -> bool:
         """Whether the last word on a shard is ours."""
@@ -91,7 +103,7 @@ class Shares:
 
     def tick(self, now: float) -> list[Action]:
         """What the first of those present offers."""
-        if self.name != min(self.present):
+        if self._leaving or self.name != min(self.present):
             return []
         due = [
             shard for shard in range(self.shards)
