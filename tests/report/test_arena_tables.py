@@ -118,6 +118,15 @@ def test_a_loss_is_beyond_both_intervals(own, lost):
     assert win.best[:2] == ("Huber", "Kalman")
 
 
+def test_who_failed_is_not_beside_who_did_not():
+    """One run of many that is lost makes an interval that overlaps everything."""
+    lost = case("bias", "gated Kalman", 1e9) | {"error_low": 0.5, "failed": True}
+    (win,) = winners(frame(case("bias", "NISE", 1.2), lost))
+    assert win.best == ("NISE",)
+    (win,) = winners(frame(case("bias", "NISE", 9.0) | {"failed": True}, lost))
+    assert win.best == ("NISE", "gated Kalman")
+
+
 def test_one_of_our_own_is_enough_and_nobody_can_win_without_a_value():
     (win,) = winners(frame(case("a", "Kalman", 1.0), case("a", "x", 9.0), case("a", "y", 1.1)))
     assert win.lost_to == ""

@@ -152,13 +152,20 @@ def _span(case: dict[str, Any], study: str) -> tuple[float, float, float]:
 
 
 def leaders(rows: list[dict[str, Any]], study: str) -> list[dict[str, Any]]:
-    """The best case, then those whose interval overlaps its own, in their order."""
+    """The best case, then those whose interval overlaps its own, in their order.
+
+    Who failed is not beside who did not: an error that one run of many makes has an interval
+    that overlaps everything.
+    """
     known = [row for row in rows if math.isfinite(_span(row, study)[0])]
     if not known:
         return []
     best = min(known, key=lambda row: _span(row, study)[0])
     reach = _span(best, study)[2]
-    return [best] + [r for r in known if r is not best and _span(r, study)[1] <= reach]
+    near = [row for row in known if row is not best and _span(row, study)[1] <= reach]
+    if study != DETECTORS and not best["failed"]:
+        near = [row for row in near if not row["failed"]]
+    return [best, *near]
 
 
 def number(value: float, digits: int = 2) -> str:

@@ -26,7 +26,8 @@ YES, NO = "\N{CHECK MARK}", "\N{BALLOT X}"
 LEGEND = (
     "Errors are root mean squares over rows and runs of the state with the largest, in units of "
     "what the first estimator has without attack. Bold: the best of the row, and all whose 95 % "
-    "interval overlaps its own. Italics: failed, 3 times the unit or more, or no estimate. "
+    "interval overlaps its own, without those who failed where the best has not. Italics: failed, "
+    "3 times the unit or more, or no estimate. "
     f"{YES}: what was promised beforehand was kept, {NO}: it was broken, neither: nothing was "
     "promised. inf: grown beyond all numbers, -: no value. Alarms are shares of the attacked rows "
     f'in per cent. "{GROWS.capitalize()}": whether lies of the sensors hit can, in theory, '
