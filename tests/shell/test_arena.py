@@ -72,6 +72,7 @@ def cases(tmp_path_factory):
     return found.set_index(["attack", "estimator"])
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_errors_are_in_units_of_the_first_estimator_without_attack(cases):
     assert cases.loc["none", "Kalman"].error == pytest.approx(1.0, rel=1e-12)
@@ -83,6 +84,7 @@ def test_errors_are_in_units_of_the_first_estimator_without_attack(cases):
     assert not cases.loc["gross", "unknown input"].failed
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_what_is_promised(cases):
     promised = cases.promise.unstack()[["Kalman", "unknown input", "NISE", "l1 decoder"]]
@@ -99,6 +101,7 @@ def test_what_is_promised(cases):
     assert exact.between(0.9, 1.1).all()
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_nobody_sees_a_covert_attack_and_everybody_a_gross_one(cases):
     assert cases.loc["covert", "Kalman"].alarms < 0.02
@@ -107,12 +110,14 @@ def test_nobody_sees_a_covert_attack_and_everybody_a_gross_one(cases):
     assert cases.false_alarms.between(0.005, 0.015).all()
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_lies_grow_only_where_a_mode_is_unstable(cases):
     assert cases.loc["gross"].attackable.tolist() == [False] * 4
     assert cases.loc["push"].attackable.isna().all()
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_the_cost_of_control_is_that_of_the_same_noise(cases):
     assert (cases.loc["none"].cost_lost == 0).all()

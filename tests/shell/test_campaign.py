@@ -285,7 +285,9 @@ def finished(folder):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.whole), 4])
+@pytest.mark.parametrize(
+    "workers", [*(pytest.param(n, marks=pytest.mark.whole) for n in (1, 2)), 4]
+)
 def test_a_cluster_gives_the_same(ran, study, workers):
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(

@@ -157,6 +157,7 @@ def test_a_bank_too_dear_to_simulate_says_so(folder):
     assert "the paper's formula" in calibrated_scenario(read_scenario(given))[1].sentence
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_simulated_replayed_and_live_believe_the_same(car):
     scenario = read_scenario(car).scenario

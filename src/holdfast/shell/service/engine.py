@@ -62,6 +62,11 @@ class Engine:
         """The number of the last frame that closed."""
         return self.frames.closed
 
+    @property
+    def newest(self) -> float:
+        """The newest stamp that was believed."""
+        return self.frames.clock.newest
+
     def next_deadline(self) -> float:
         """Our clock's time when the next frame closes whatever comes; inf if that is not known."""
         return self.frames.next_deadline()
@@ -71,7 +76,8 @@ class Engine:
         late = self.frames.take(samples, now)
         if late is not None and self._refilter:
             self._revise(late, samples)
-        return self.advance(now)
+        # by the newest stamp alone: while messages wait to be read our clock is ahead of them
+        return self.advance(-math.inf)
 
     def advance(self, now: float) -> Worked:
         """The frames that time has closed."""

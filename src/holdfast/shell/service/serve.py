@@ -109,10 +109,15 @@ class Service:
         await source.run(take)
 
     async def _deadlines(self) -> None:
-        """Close the frames that nothing completes."""
+        """Close the frames that nothing completes, unless newer stamps come in: they tell the time
+        better than our clock, which does not know what waits to be read.
+        """
+        newest = -math.inf
         while True:
             now = time.monotonic()
-            self._hand_on(self._engine.advance(now), now)
+            if self._engine.newest == newest:
+                self._hand_on(self._engine.advance(now), now)
+            newest = self._engine.newest
             wait = self._engine.next_deadline() - time.monotonic()
             await asyncio.sleep(min(max(wait, SOONEST), TICK))
 

@@ -80,6 +80,11 @@ class FleetEngine:
         """The number of the newest frame."""
         return self.timing.newest
 
+    @property
+    def newest(self) -> float:
+        """The newest stamp that was believed."""
+        return self.timing.clock.newest
+
     def next_deadline(self) -> float:
         """Our clock's time when a frame closes whatever comes; inf if that is not known."""
         return self.timing.next_deadline()
@@ -90,7 +95,8 @@ class FleetEngine:
         for number, believed in self.timing.take(batch, now):
             self._tell_jump(number, believed.time, worked)
             self._place(number, believed, worked)
-        self._close(now, worked)
+        # by the newest stamp alone: while messages wait to be read our clock is ahead of them
+        self._close(-math.inf, worked)
         return worked
 
     def advance(self, now: float) -> Worked:

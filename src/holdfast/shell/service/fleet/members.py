@@ -12,14 +12,11 @@ class Members:
         self._free = list(range(most - 1, -1, -1))
         self.ids = np.zeros(most, np.uint64)
         """The plant at each place; only of those that are taken."""
+        self.taken = np.zeros(0, int)
+        """The places that are taken, in order."""
 
     def __len__(self) -> int:
         return len(self._places)
-
-    @property
-    def taken(self) -> np.ndarray:
-        """The places that are taken, in order."""
-        return np.sort(np.fromiter(self._places.values(), int, len(self._places)))
 
     def places(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The place of each plant, -1 where there is none left, and which are new."""
@@ -30,6 +27,8 @@ class Members:
             if self._free:
                 found[at] = self._admit(int(ids[at]))
                 new[at] = True
+        if new.any():
+            self._note_taken()
         return found, new
 
     def leave(self, places: np.ndarray) -> None:
@@ -37,6 +36,10 @@ class Members:
         for place in places.tolist():
             del self._places[int(self.ids[place])]
             self._free.append(place)
+        self._note_taken()
+
+    def _note_taken(self) -> None:
+        self.taken = np.sort(np.fromiter(self._places.values(), int, len(self._places)))
 
     def _admit(self, identity: int) -> int:
         place = self._free.pop()
@@ -51,3 +54,4 @@ class Members:
         self.ids[places] = ids
         held = set(self._places.values())
         self._free = [place for place in range(self.most - 1, -1, -1) if place not in held]
+        self._note_taken()
