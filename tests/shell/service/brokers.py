@@ -1,5 +1,6 @@
 """A real Mosquitto on the loopback, with a configuration of its own."""
 
+import asyncio
 import shutil
 import socket
 import subprocess
@@ -45,3 +46,13 @@ class Mosquitto:
             self._running.kill()
             self._running.wait()
             self._running = None
+
+
+async def until(condition, what="what was waited for has not come", seconds=30.0):
+    """Wait for something to be so."""
+    try:
+        async with asyncio.timeout(seconds):
+            while not condition():
+                await asyncio.sleep(0.01)
+    except TimeoutError:
+        raise AssertionError(what) from None

@@ -12,7 +12,7 @@ import aiomqtt
 import numpy as np
 import pytest
 
-from brokers import Mosquitto
+from brokers import Mosquitto, until
 from holdfast.loop import replay
 from holdfast.records import Observation, Status
 from holdfast.shell.service.building import build_engine
@@ -165,15 +165,6 @@ port = {port}
 prefix = "out"
 """
 ROUNDS, EACH = 20, 5
-
-
-async def until(condition, what, seconds=30.0):
-    try:
-        async with asyncio.timeout(seconds):
-            while not condition():
-                await asyncio.sleep(0.01)
-    except TimeoutError:
-        raise AssertionError(what) from None
 
 
 async def through(broker, folder, rounds):

@@ -11,7 +11,7 @@ import aiomqtt
 import numpy as np
 import pytest
 
-from brokers import Mosquitto
+from brokers import Mosquitto, until
 from holdfast.loop import replay
 from holdfast.records import Observation
 from holdfast.shell.errors import InputError
@@ -68,12 +68,6 @@ def logs():
     )  # fmt: skip
     values[3, 25:, 1] += 5.0
     return values
-
-
-async def until(condition, seconds=20.0):
-    async with asyncio.timeout(seconds):
-        while not condition():
-            await asyncio.sleep(0.01)
 
 
 async def played(broker, folder, values, rows, rubbish=()):
@@ -159,6 +153,7 @@ def prepared(folder):
     ("most = 50", "most = 0", ["fleet.most", "0"]),
     ("most = 50", "mosd = 50", ["fleet.mosd", "most"]),
     ("most = 50", "most = 10000000", ["fleet.most", "GiB", "or fewer"]),
+    ("most = 50", 'prefix = "group"', ["fleet.shards", "no prefix"]),
     ("[checkpoint]", "[sensors]\nlevel = 1e-3\n[checkpoint]", ["sensors", "a fleet has"]),
     ('rule = "source"', 'late = "refilter"', ["clock.late", "a fleet has"]),
     ('topic = "fleet/+/samples"', "", ["source[1].topic"]),

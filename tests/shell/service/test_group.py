@@ -10,7 +10,7 @@ import aiomqtt
 import numpy as np
 import pytest
 
-from brokers import Mosquitto
+from brokers import Mosquitto, until
 from holdfast.loop import replay
 from holdfast.records import Observation
 from holdfast.shell.files import load_scenario
@@ -78,15 +78,6 @@ class Heard:
         """Every shard is somebody's, and so many processes have some."""
         names = [self.owners.get(i, "") for i in range(SHARDS)]
         return all(names) and len(set(names)) == count and len(self.taken) == SHARDS
-
-
-async def until(condition, what, seconds=60.0):
-    try:
-        async with asyncio.timeout(seconds):
-            while not condition():
-                await asyncio.sleep(0.02)
-    except TimeoutError:
-        raise AssertionError(what) from None
 
 
 def rows_of(values, k):

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from brokers import Mosquitto
+from brokers import Mosquitto, until
 from holdfast.shell.service.limits import RateLimit
 from holdfast.shell.service.mqtt import Broker, MqttSink, MqttSource, said_of
 from holdfast.shell.service.records import Samples
@@ -26,13 +26,6 @@ def broker(tmp_path):
     found = Mosquitto(tmp_path).start()
     yield found
     found.stop()
-
-
-async def until(condition, seconds=10.0):
-    """Wait for something to be so."""
-    async with asyncio.timeout(seconds):
-        while not condition():
-            await asyncio.sleep(0.005)
 
 
 def client(broker):

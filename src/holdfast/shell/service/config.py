@@ -150,6 +150,9 @@ def _check_fleet(path: str, found: Any) -> None:
     refused = {"sensors": found.sensors, "auth": found.auth, "page": found.page,
                "fallback.rule": "rule" in found.fallback, "clock.late": "late" in found.clock,
                "clock.window": "window" in found.clock}  # fmt: skip
+    if found.fleet.get("shards") is None and found.fleet.get("prefix") is not None:
+        raise InputError(path, "fleet.shards", "nothing beside fleet.prefix",
+                         "a number of shards, or no prefix")  # fmt: skip
     if found.fleet.get("shards") is not None:
         if found.checkpoint is None:
             raise InputError(path, "checkpoint", "nothing", "a file: a shard's state follows it")

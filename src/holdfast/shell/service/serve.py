@@ -1,9 +1,7 @@
 """`holdfast live`: sources to engine to sinks, in one event loop, until told to stop."""
 
 import asyncio
-import contextlib
 import math
-import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -20,6 +18,7 @@ from holdfast.shell.service.episodes import event
 from holdfast.shell.service.parts import Parts, build_parts
 from holdfast.shell.service.sinks import Sink
 from holdfast.shell.service.sources import Source
+from holdfast.shell.service.stopping import stop_on_signals
 
 TICK = 0.05
 """Seconds between two looks at the deadlines where none is known to come sooner."""
@@ -65,10 +64,7 @@ class Service:
 
     async def run(self) -> None:
         """Until every source has ended, or a signal comes; the state is kept at the end."""
-        loop = asyncio.get_running_loop()
-        with contextlib.suppress(NotImplementedError):  # Windows has no such handlers
-            for number in (signal.SIGINT, signal.SIGTERM):
-                loop.add_signal_handler(number, self._stop.set)
+        stop_on_signals(self._stop)
         resumed = self._resume()
         for sink in self._sinks:
             await sink.start()

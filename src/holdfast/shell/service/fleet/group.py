@@ -8,7 +8,6 @@ on.
 import asyncio
 import contextlib
 import secrets
-import signal
 import socket
 import sys
 import time
@@ -31,6 +30,7 @@ from holdfast.shell.service.limits import Backoff
 from holdfast.shell.service.mqtt import Broker, gone
 from holdfast.shell.service.sinks import Sink
 from holdfast.shell.service.sources import Counters
+from holdfast.shell.service.stopping import stop_on_signals
 
 TICK = 0.02
 """Seconds between two looks at the deadlines."""
@@ -91,10 +91,9 @@ class Group:
 
     async def run(self) -> None:
         """Until a signal comes."""
-        loop = asyncio.get_running_loop()
-        with contextlib.suppress(NotImplementedError):  # Windows has no such handlers
-            for number in (signal.SIGINT, signal.SIGTERM):
-                loop.add_signal_handler(number, self._stop.set)
+        from aiomqtt import MqttError
+
+        stop_on_signals(self._stop)
         for sink in self._sinks:
             await sink.start()
         backoff = Backoff()
@@ -102,19 +101,13 @@ class Group:
             while not self._stop.is_set():
                 try:
                     await self._connected(backoff.succeeded)
-                except (self._errors(), OSError):
+                except (MqttError, OSError):
                     self.counters.disconnects += 1
                     with contextlib.suppress(TimeoutError):
                         await asyncio.wait_for(self._stop.wait(), backoff.pause())
         finally:
             for sink in reversed(self._sinks):
                 await sink.stop()
-
-    @staticmethod
-    def _errors() -> type[Exception]:
-        import aiomqtt
-
-        return aiomqtt.MqttError
 
     async def _connected(self, succeeded: Callable[[], None]) -> None:
         """A connection: a new name, because the broker has said of the old one that it is gone."""
