@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import holdfast
 from holdfast.campaign.blocks import BLOCK
 from holdfast.shell import runtime
-from holdfast.shell.executors import Local, Task, cores
+from holdfast.shell.executors import Local, Task
 from holdfast.shell.points import prepare
 from holdfast.shell.study import read_study
 
@@ -109,12 +109,12 @@ def compare(runs: int) -> None:
         return lambda: list(Local(prepared, workers).run(tasks))
 
     reference, one = timed(scan), timed(campaign(1))
-    print(f"{runs} runs of {STEPS} steps, {cores()} cores; the best of five")
+    print(f"{runs} runs of {STEPS} steps, {runtime.cores()} cores; the best of five")
     steps = runs * STEPS
     for name, seconds in (
         ("bare scan, one block at a time", reference),
         ("campaign, one thread", one),
-        (f"campaign, {cores()} threads", timed(campaign(cores()))),
+        (f"campaign, {runtime.cores()} threads", timed(campaign(runtime.cores()))),
     ):
         rate = f"{1e6 * seconds / steps:.3f} us a step, {seconds / reference:.2f} of the bare scan"
         print(f"{name:32s} {seconds:6.2f} s, {rate}", flush=True)

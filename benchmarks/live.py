@@ -6,7 +6,6 @@ A Mosquitto, `holdfast live` and this sender and listener share the machine. Lat
 just before a frame is published to when its estimate has been received here.
 """
 
-import asyncio
 import contextlib
 import json
 import shutil
@@ -14,11 +13,12 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 
-import aiomqtt
 import numpy as np
+from lean_mqtt import Client
 
 PLANT = """\
 [plant]
@@ -76,53 +76,38 @@ def broker(folder):
         running.wait()
 
 
-async def measure(port, rate, seconds, messages):
-    """Send ``rate`` frames a second; what came back, and how late."""
-    sent, late, stop = {}, [], asyncio.Event()
+def measure(port, rate, seconds, messages):
+    """Send ``rate`` frames a second; how many, and how late what came back was."""
+    sent, late = {}, []
     values = np.random.default_rng(0).normal(size=(1000, 64))
-    count = int(rate * seconds)
+    listener, sender = Client(port), Client(port)
+    listener.subscribe("out/estimate")
 
-    async def listen(ready):
-        async with aiomqtt.Client("127.0.0.1", port, max_queued_outgoing_messages=0) as client:
-            await client.subscribe("out/estimate")
-            ready.set()
-            async for message in client.messages:
-                now = time.perf_counter()
-                frame = json.loads(message.payload)
-                begun = sent.get(round(frame["time"] * rate))
-                if begun is not None:
-                    late.append(now - begun)
-                if len(late) >= count or stop.is_set():
-                    return
+    def listen():
+        for payload in listener.messages(timeout=5.0):
+            now = time.perf_counter()
+            begun = sent.get(round(json.loads(payload)["time"] * rate))
+            if begun is not None:
+                late.append(now - begun)
 
-    ready = asyncio.Event()
-    listening = asyncio.create_task(listen(ready))
-    await ready.wait()
-    async with aiomqtt.Client("127.0.0.1", port) as client:
-        await warmed(client, messages, values, rate)
-        start = time.perf_counter()
-        for k in range(count):
-            wait = start + k / rate - time.perf_counter()
-            if wait > 0:
-                await asyncio.sleep(wait)
-            number = 10 * rate + k
-            sent[number] = time.perf_counter()
-            for topic, payload in messages(number / rate, values[k % 1000]):
-                await client.publish(topic, payload)
-    stopping = asyncio.get_running_loop().call_later(5.0, stop.set)
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(6.0):
-            await listening
-    stopping.cancel()
+    listening = threading.Thread(target=listen)
+    listening.start()
+    # frames until the service has surely subscribed and compiled
+    begin, warm, count = time.perf_counter(), 3 * rate, int(rate * seconds)
+    for k in range(warm + count):
+        wait = begin + k / rate - time.perf_counter()
+        if wait > 0:
+            time.sleep(wait)
+        found = messages(7 + k / rate, values[k % 1000])
+        if k >= warm:
+            sent[7 * rate + k] = time.perf_counter()
+        for topic, payload in found:
+            sender.publish(topic, payload.encode())
+    behind = time.perf_counter() - begin - (warm + count) / rate
+    listening.join()
+    if behind > 0.1:
+        print(f"the sender was {behind:.1f} s behind at the end", flush=True)
     return count, np.sort(late)
-
-
-async def warmed(client, messages, values, rate):
-    """Frames until the service has surely subscribed and compiled."""
-    for k in range(3 * rate):
-        for topic, payload in messages(7 + k / rate, values[0]):
-            await client.publish(topic, payload)
-        await asyncio.sleep(1 / rate)
 
 
 def case(name, rate, seconds, outputs, messages, topics):
@@ -136,7 +121,7 @@ def case(name, rate, seconds, outputs, messages, topics):
         running = subprocess.Popen([holdfast, "live", folder / "live.toml"])
         try:
             time.sleep(20)
-            count, late = asyncio.run(measure(port, rate, seconds, messages))
+            count, late = measure(port, rate, seconds, messages)
         finally:
             running.terminate()
             running.wait()

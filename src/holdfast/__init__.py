@@ -15,15 +15,22 @@ if "jax" in sys.modules:
     sys.modules["jax"].config.update("jax_enable_x64", True)
 else:
     os.environ["JAX_ENABLE_X64"] = "1"
-# XLA's CPU backend runs a program operation by operation, but compiles a loop whole where the
-# arrays it touches are small: by default up to 1 KiB, which no filter meets. Up to 16 MiB a
-# trajectory of a small plant is one kernel, and 4 times faster. Without effect once JAX has
-# computed something, and where XLA_FLAGS already says otherwise.
-if "xla_backend_extra_options" not in os.environ.get("XLA_FLAGS", ""):
-    os.environ["XLA_FLAGS"] = (
-        os.environ.get("XLA_FLAGS", "")
-        + " --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=16777216"
-    ).strip()
+# How XLA compiles for a CPU; without effect once JAX has computed something, and where XLA_FLAGS
+# says otherwise.
+_FLAGS = {
+    # It runs a program operation by operation, but compiles a loop whole where the arrays it
+    # touches are small: by default up to 1 KiB, which no filter meets. Up to 16 MiB a trajectory
+    # of a small plant is one kernel, and 4 times faster.
+    "xla_backend_extra_options": "xla_cpu_small_while_loop_byte_threshold=16777216",
+    # The older way of writing kernels compiles in 0.6 of the time, and what it compiles is as
+    # fast (docs/benchmarks.md).
+    "xla_cpu_use_fusion_emitters": "false",
+}
+_given = os.environ.get("XLA_FLAGS", "")
+os.environ["XLA_FLAGS"] = " ".join(
+    ([_given] if _given else [])
+    + [f"--{name}={value}" for name, value in _FLAGS.items() if name not in _given]
+)
 
 _PUBLIC = {
     "Observation": "records",

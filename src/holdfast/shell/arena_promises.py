@@ -9,12 +9,12 @@ from holdfast.analysis.attackable import attackable
 from holdfast.analysis.model import Model, model_at
 from holdfast.analysis.observability import observability
 from holdfast.analysis.promises import Hit, decoupled, of_decoder, of_fusion
-from holdfast.campaign.blocks import single
 from holdfast.estimators.kalman import Kalman
 from holdfast.estimators.l1_decoder import L1Decoder
 from holdfast.estimators.nise import Nise
 from holdfast.estimators.secure_fusion import SecureFusion
 from holdfast.estimators.unknown_input import UnknownInput
+from holdfast.loop import replay
 from holdfast.numerics.local import Unfit, decompose
 from holdfast.numerics.steady_state import steady_state
 from holdfast.numerics.stealth import Stealth
@@ -23,6 +23,7 @@ from holdfast.plants.linear import LinearPlant
 from holdfast.plants.watched import watched
 from holdfast.reach.bounds import reach
 from holdfast.reach.setting import Setting
+from holdfast.records import Observation
 from holdfast.shell.points import Prepared
 from holdfast.shell.study import TRUTH
 
@@ -111,7 +112,9 @@ class Promises:
         if not decoupled(_model(plant), B, D, hit, active):
             return None
         if quiet not in self._known:
-            covariance = single(case, self._prepared.keys[quiet], 0).estimate.x_cov
+            nothing = np.zeros((case.steps, len(plant.inputs)))
+            rows = Observation.of(nothing, np.zeros((case.steps, len(plant.outputs))))
+            covariance = replay(case.scenario.monitor, rows).estimate.x_cov
             variance = np.asarray(jnp.diagonal(covariance, axis1=1, axis2=2))
             kept = np.isfinite(variance)
             mean = np.sum(np.where(kept, variance, 0.0), 0) / np.maximum(kept.sum(0), 1)
