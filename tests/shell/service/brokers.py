@@ -20,15 +20,17 @@ class Mosquitto:
             probe.bind(("127.0.0.1", 0))
             self.port = probe.getsockname()[1]
         self._config = folder / "mosquitto.conf"
-        self._config.write_text(
-            f"listener {self.port} 127.0.0.1\nallow_anonymous true\npersistence false\n"
-            "max_queued_messages 100000\n"
-        )
+        self.configure("allow_anonymous true")
         self._program, self._running = program, None
+
+    def configure(self, *lines):
+        """What is not the same for every test."""
+        always = (f"listener {self.port} 127.0.0.1", "persistence false",
+                  "max_queued_messages 100000")  # fmt: skip
+        self._config.write_text("".join(f"{line}\n" for line in (*always, *lines)))
 
     def start(self):
         """Start, and wait until it listens."""
-        # Mosquitto gives up root for a user that need not be able to read a test's folder
         self._running = subprocess.Popen(
             [self._program, "-c", str(self._config)],
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
@@ -38,6 +40,7 @@ class Mosquitto:
                 if probe.connect_ex(("127.0.0.1", self.port)) == 0:
                     return self
             time.sleep(0.01)
+        self.stop()
         raise TimeoutError("mosquitto does not listen")
 
     def stop(self):

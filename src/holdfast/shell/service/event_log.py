@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from holdfast.shell.errors import InputError
-from holdfast.shell.service.records import Event, Row
+from holdfast.shell.service.records import Event
 from holdfast.shell.service.sinks import Sink
 
 PENDING = 10_000
@@ -74,7 +74,7 @@ class EventLog(Sink):
         except sqlite3.Error as error:
             raise InputError(path, "", f"no usable file ({error})", "an event log") from None
 
-    def row(self, row: Row) -> None:
+    def row(self, row: Any) -> None:
         """Write what has waited long enough."""
         if time.monotonic() >= self._due:
             self.flush()

@@ -2,19 +2,14 @@
 
 import asyncio
 import contextlib
-import dataclasses
-import logging
-import socket
-import ssl
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from itertools import islice
 from typing import Any
 
-from holdfast.shell.errors import InputError
-from holdfast.shell.service.limits import Backoff, RateLimit
+from holdfast.shell.service.broker import Attempts, Broken, Broker, Connection
+from holdfast.shell.service.limits import RateLimit
 from holdfast.shell.service.records import Event, Labels, Row
 from holdfast.shell.service.saying import dumps, event_object, row_object
 from holdfast.shell.service.sinks import Sink
@@ -23,80 +18,14 @@ from holdfast.shell.service.wire import LIMIT
 
 RATE = 50_000
 """Messages a second that are looked at; more are counted and left alone."""
-KEPT = 3600
-"""Seconds for which a broker keeps the messages of a client that has an id and asks for qos 1."""
 EVENTS = 10_000
 """Events held while there is no broker."""
-BATCH = 10
-"""Messages of qos 0 published at once, which costs half of one after the other."""
+UNDER_WAY = 64
+"""Messages of rows given to the network that are not out yet, at most."""
+SOON = 0.005
+"""Seconds until a network that was full is tried again."""
 LAST = 2.0
 """Seconds that are taken at the end to send what is held."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Broker:
-    """Where the broker is, and who we are to it."""
-
-    host: str = "127.0.0.1"
-    port: int = 1883
-    client_id: str | None = None
-    username: str | None = None
-    password: str | None = dataclasses.field(default=None, repr=False)
-    tls: ssl.SSLContext | None = None
-    qos: int = 0
-
-    def client(self, *, keep: bool, handle: Callable[[Any], None], will: Any = None) -> Any:
-        """A client of aiomqtt. ``keep``: the broker holds messages while we are away; ``will``:
-        what it says for us when we are gone.
-
-        ``handle`` is given every message as soon as it is read.
-        """
-        import aiomqtt
-        from paho.mqtt.packettypes import PacketTypes
-        from paho.mqtt.properties import Properties
-
-        properties = Properties(PacketTypes.CONNECT)
-        keep = keep and self.qos > 0 and self.client_id is not None
-        if keep:
-            properties.SessionExpiryInterval = KEPT
-        quiet = logging.getLogger("holdfast.mqtt")
-        quiet.disabled = True  # what goes wrong is counted and told, not printed
-        return aiomqtt.Client(
-            self.host, self.port, username=self.username, password=self.password,
-            identifier=self.client_id, protocol=aiomqtt.ProtocolVersion.V5, keepalive=10,
-            clean_start=not keep, properties=properties, tls_context=self.tls, logger=quiet,
-            will=will,
-            queue_type=_direct(handle), max_queued_outgoing_messages=0, timeout=10.0,
-            # small messages one after the other must not wait for what was sent before
-            socket_options=[(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)],
-        )  # fmt: skip
-
-
-def _direct(handle: Callable[[Any], None]) -> type[asyncio.Queue[Any]]:
-    """A queue in which nothing waits: to take messages out costs a task and a future each."""
-
-    class Direct(asyncio.Queue[Any]):
-        def put_nowait(self, item: Any) -> None:
-            handle(item)
-
-    return Direct
-
-
-async def gone(client: Any) -> None:
-    """Wait until the connection breaks, which aiomqtt tells those who wait for messages.
-
-    Always raises its `MqttError`.
-    """
-    async for _ in client.messages:
-        pass
-
-
-def check_package(file: str, key: str) -> None:
-    """Raises `InputError` where the package is not installed."""
-    try:
-        import aiomqtt  # noqa: F401
-    except ImportError:
-        raise InputError(file, key, "no package for MQTT", 'pip install "holdfast[mqtt]"') from None
 
 
 class MqttSource(Source):
@@ -115,30 +44,34 @@ class MqttSource(Source):
         self.connected = False
         exact_first = sorted(topics, key=lambda t: ("#" in t, t.count("+"), -t.count("/")))
         self._broker, self._topics = broker, {topic: topics[topic] for topic in exact_first}
+        # a share of a subscription: $share/NAME/PATTERN
+        self._patterns = {
+            topic.split("/", 2)[2] if topic.startswith("$share/") else topic: decode
+            for topic, decode in self._topics.items()
+        }
         self._limit = RateLimit(RATE)
 
     async def run(self, take: Take) -> None:
-        """Hand on messages for ever; connect again whenever the connection breaks."""
-        import aiomqtt
+        """Hand on messages for ever; connect again whenever the connection breaks.
 
-        backoff, handle = Backoff(), partial(self._message, take)
+        Raises what ``take`` raises, which is a fault of ours.
+        """
+        attempts = Attempts(self.name, self._broker, self.counters)
+        handle = partial(self._message, take)
         while True:
             try:
-                async with self._broker.client(keep=True, handle=handle) as client:
-                    for topic in self._topics:
-                        await client.subscribe(topic, qos=self._broker.qos)
-                    backoff.succeeded()
+                async with self._broker.connection(handle, keep=True) as connection:
+                    await connection.subscribe(self._topics, self._broker.qos)
+                    attempts.succeeded()
                     self.connected = True
-                    await gone(client)
-            except (aiomqtt.MqttError, OSError):
+                    await connection.gone()
+            except Broken as error:
                 self.connected = False
-                self.counters.disconnects += 1
-                await asyncio.sleep(backoff.pause())
+                await attempts.failed(error)
 
-    def _message(self, take: Take, message: Any) -> None:
+    def _message(self, take: Take, topic: str, payload: bytes) -> None:
         self.counters.messages += 1
-        payload = message.payload
-        decode = self._decoder(message.topic)
+        decode = self._decoder(topic)
         samples = None
         if isinstance(payload, bytes) and len(payload) <= self._longest and decode is not None:
             samples = decode(payload) if self._limit.allow(time.monotonic()) else None
@@ -147,11 +80,14 @@ class MqttSource(Source):
         else:
             take(samples)
 
-    def _decoder(self, topic: Any) -> Callable[[bytes], Any] | None:
-        found = self._topics.get(topic.value)
-        if found is not None:
-            return found
-        return next((d for pattern, d in self._topics.items() if topic.matches(pattern)), None)
+    def _decoder(self, topic: str) -> Callable[[bytes], Any] | None:
+        found = self._topics.get(topic)
+        return found if found is not None else self._by_pattern(topic)
+
+    def _by_pattern(self, topic: str) -> Callable[[bytes], Any] | None:
+        from paho.mqtt.client import topic_matches_sub
+
+        return next((d for p, d in self._patterns.items() if topic_matches_sub(p, topic)), None)
 
 
 Said = Callable[[Any], Iterable[tuple[str, bytes]]]
@@ -185,9 +121,13 @@ class MqttSink(Sink):
         self.name, self.counters = name, Counters()
         self._broker, self._said, self._prefix = broker, said, prefix
         self._rows: deque[tuple[str, bytes]] = deque()
+        self._under_way: deque[tuple[tuple[str, bytes], Callable[[], bool]]] = deque()
+        """Messages of rows given to the network, with what tells whether they are out."""
         self._events: deque[tuple[str, bytes]] = deque()
         self._capacity = capacity
         self._waiting = asyncio.Event()
+        self._connection: Connection | None = None
+        self._coming_back = False
         self._task: asyncio.Task[None] | None = None
 
     async def start(self) -> None:
@@ -195,13 +135,16 @@ class MqttSink(Sink):
         self._task = asyncio.create_task(self._send())
 
     def row(self, row: Any) -> None:
-        """Take a row."""
+        """Take a row, and send it at once where that can be."""
         for topic, message in self._said(row):
-            if len(self._rows) >= self._capacity:
+            if len(self._rows) + len(self._under_way) >= self._capacity and self._rows:
                 self._rows.popleft()
                 self.counters.lost += 1
             self._rows.append((f"{self._prefix}/{topic}", message))
-        self._waiting.set()
+        if self._broker.qos:
+            self._waiting.set()
+        else:
+            self._write_rows()
 
     def event(self, event: Event) -> None:
         """Take an event."""
@@ -216,61 +159,90 @@ class MqttSink(Sink):
         """Send what is held, if that is soon done."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(LAST):
-                while self._rows or self._events:
+                while self._rows or self._events or self._under_way:
+                    self._write_rows()
                     await asyncio.sleep(0.01)
         if self._task is not None:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
 
     async def _send(self) -> None:
-        import aiomqtt
-
-        backoff = Backoff()
+        attempts = Attempts(self.name, self._broker, self.counters)
         while True:
             try:
-                async with self._broker.client(keep=False, handle=lambda _: None) as client:
-                    backoff.succeeded()
-                    await self._send_by(client)
-            except (aiomqtt.MqttError, OSError):
-                self.counters.disconnects += 1
-                await asyncio.sleep(backoff.pause())
+                async with self._broker.connection(lambda *_: None) as connection:
+                    attempts.succeeded()
+                    await self._send_by(connection)
+            except Broken as error:
+                await attempts.failed(error)
 
-    async def _send_by(self, client: Any) -> None:
+    async def _send_by(self, connection: Connection) -> None:
         """Publish whatever comes until the connection breaks."""
-        watch = asyncio.create_task(self._until_gone(client))
+        watch = asyncio.create_task(self._until_gone(connection))
         try:
+            await self._emptied(connection)  # the oldest news
+            self._connection = connection
+            self._write_rows()
             while not watch.done():
                 await self._waiting.wait()
-                await self._emptied(client)
+                await self._emptied(connection)
             await watch
         finally:
+            self._connection = None
+            self._take_back()
             watch.cancel()
             await asyncio.gather(watch, return_exceptions=True)
 
-    async def _until_gone(self, client: Any) -> None:
+    async def _until_gone(self, connection: Connection) -> None:
         """Wait until the connection breaks, and wake the one who sends."""
         try:
-            await gone(client)
+            await connection.gone()
         finally:
             self._waiting.set()
 
-    async def _emptied(self, client: Any) -> None:
-        """Publish all that is held, events first; a message is given up only when it is out."""
+    def _write_rows(self) -> None:
+        """Give rows to the network without waiting for it: a task for every message would cost
+        more than the row, and would wait until those who read pause.
+        """
+        connection = self._connection
+        if connection is None or self._broker.qos:
+            return
+        while self._rows and len(self._under_way) < UNDER_WAY:
+            message = self._rows.popleft()
+            self._under_way.append((message, connection.hand_over(*message)))
+        connection.write()
+        self._count_out()
+        if self._under_way and not self._coming_back:
+            self._coming_back = True
+            asyncio.get_running_loop().call_later(SOON, self._come_back)
+
+    def _come_back(self) -> None:
+        self._coming_back = False
+        self._write_rows()
+
+    def _count_out(self) -> None:
+        while self._under_way and self._under_way[0][1]():
+            self._under_way.popleft()
+            self.counters.messages += 1
+
+    def _take_back(self) -> None:
+        """What was given to a connection that is gone is to be sent again."""
+        self._count_out()
+        self._rows.extendleft(message for message, _ in reversed(self._under_way))
+        self._under_way.clear()
+
+    async def _emptied(self, connection: Connection) -> None:
+        """Publish what waits for acknowledgements, events first; each is given up only when it is
+        out. One at a time: a broker's small acknowledgements wait for each other.
+        """
         self._waiting.clear()
-        while held := self._events or self._rows:
-            qos = 1 if held is self._events else self._broker.qos
-            # a broker's small acknowledgements wait for each other: none of several at once
-            batch = list(islice(held, 1 if qos else BATCH))
-            found = await asyncio.gather(
-                *(client.publish(*message, qos=qos) for message in batch), return_exceptions=True
-            )
-            for message, failure in zip(batch, found, strict=True):
-                if failure is not None:
-                    raise failure
-                # a full buffer may have dropped it meanwhile
-                if held and held[0] is message:
-                    held.popleft()
-                self.counters.messages += 1
+        while held := self._events or (self._rows if self._broker.qos else None):
+            message = held[0]
+            await connection.publish(*message, qos=1 if held is self._events else self._broker.qos)
+            # a full buffer may have dropped it meanwhile
+            if held and held[0] is message:
+                held.popleft()
+            self.counters.messages += 1
 
 
 _JUDGED = ("statistic", "threshold", "alarm", "reason")

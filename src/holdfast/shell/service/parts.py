@@ -158,7 +158,7 @@ def broker_of(table: Table, keys: Any, config: LiveConfig) -> Any:
     """The broker that `BrokerKeys` name. Raises `InputError`."""
     import ssl
 
-    from holdfast.shell.service.mqtt import Broker, check_package
+    from holdfast.shell.service.broker import Broker, check_package
 
     check_package(table.file, table.key)
     password = None

@@ -17,6 +17,7 @@ from typing import Any
 
 from holdfast import __version__
 from holdfast.shell.errors import InputError
+from holdfast.shell.service.broker import Attempts, Broken, Broker, Connection
 from holdfast.shell.service.checkpoint import (
     checkpoint_words,
     read_checkpoint,
@@ -26,8 +27,6 @@ from holdfast.shell.service.episodes import event
 from holdfast.shell.service.fleet.engine import FleetEngine, Worked
 from holdfast.shell.service.fleet.shares import Action, Shares
 from holdfast.shell.service.fleet.wire import LIMIT, Batch
-from holdfast.shell.service.limits import Backoff
-from holdfast.shell.service.mqtt import Broker, gone
 from holdfast.shell.service.sinks import Sink
 from holdfast.shell.service.sources import Counters
 from holdfast.shell.service.stopping import stop_on_signals
@@ -91,20 +90,16 @@ class Group:
 
     async def run(self) -> None:
         """Until a signal comes."""
-        from aiomqtt import MqttError
-
         stop_on_signals(self._stop)
         for sink in self._sinks:
             await sink.start()
-        backoff = Backoff()
+        attempts = Attempts("fleet", self._broker, self.counters)
         try:
             while not self._stop.is_set():
                 try:
-                    await self._connected(backoff.succeeded)
-                except (MqttError, OSError):
-                    self.counters.disconnects += 1
-                    with contextlib.suppress(TimeoutError):
-                        await asyncio.wait_for(self._stop.wait(), backoff.pause())
+                    await self._connected(attempts.succeeded)
+                except Broken as error:
+                    await attempts.failed(error, self._stop)
         finally:
             for sink in reversed(self._sinks):
                 await sink.stop()
@@ -120,27 +115,27 @@ class Group:
         here = f"{self._prefix}/processes/{name}"
         will = aiomqtt.Will(here, NOBODY, qos=1, retain=True)
 
-        def handle(message: Any) -> None:
-            shard = self._topics.get(message.topic.value)
+        def handle(topic: str, payload: bytes) -> None:
+            shard = self._topics.get(topic)
             if shard is not None:
-                self._take(shard, message.payload)
-                return
-            kind, of = message.topic.value.rsplit("/", 2)[1:]
-            words.put_nowait((kind, of, bytes(message.payload or b"")))
+                self._take(shard, payload)
+            elif topic.startswith(f"{self._prefix}/"):
+                kind, of = topic.rsplit("/", 2)[1:]
+                words.put_nowait((kind, of, bytes(payload or b"")))
 
-        async with self._broker.client(keep=False, handle=handle, will=will) as client:
+        async with self._broker.connection(handle, will=will) as client:
             await client.publish(here, b"here", qos=1, retain=True)
-            for pattern in (
+            patterns = (
                 f"{self._prefix}/processes/+", f"{self._prefix}/owners/+",
                 f"$share/holdfast/{self._prefix}/offers/+",
-            ):  # fmt: skip
-                await client.subscribe(pattern, qos=1)
+            )  # fmt: skip
+            await client.subscribe(patterns, 1)
             succeeded()
             tasks = [
                 asyncio.create_task(task)
                 for task in (
                     self._listen(client, shares, words), self._offer(client, shares),
-                    self._deadlines(), self._checkpoints(shares), gone(client),
+                    self._deadlines(), self._checkpoints(shares), client.gone(),
                     self._stop.wait(),
                 )
             ]  # fmt: skip
@@ -157,7 +152,7 @@ class Group:
                 # whoever takes them over has their state, and ours is an old one
                 self._gave_up(*self.at_work)
 
-    async def _leave(self, client: Any, shares: Shares, here: str) -> None:
+    async def _leave(self, client: Connection, shares: Shares, here: str) -> None:
         """Keep every state, and say that it can be had."""
         await self._do(client, shares, shares.leave())
         with contextlib.suppress(TimeoutError):
@@ -167,7 +162,7 @@ class Group:
         await client.publish(here, NOBODY, qos=1, retain=True)
 
     async def _listen(
-        self, client: Any, shares: Shares, words: "asyncio.Queue[tuple[str, str, bytes]]"
+        self, client: Connection, shares: Shares, words: "asyncio.Queue[tuple[str, str, bytes]]"
     ) -> None:
         while True:
             kind, of, payload = await words.get()
@@ -181,13 +176,13 @@ class Group:
                 actions = shares.hear_offer(int(of))
             await self._do(client, shares, actions)
 
-    async def _offer(self, client: Any, shares: Shares) -> None:
+    async def _offer(self, client: Connection, shares: Shares) -> None:
         await asyncio.sleep(SETTLED)
         while True:
             await self._do(client, shares, shares.tick(time.monotonic()))
             await asyncio.sleep(OFFERS)
 
-    async def _do(self, client: Any, shares: Shares, actions: list[Action]) -> None:
+    async def _do(self, client: Connection, shares: Shares, actions: list[Action]) -> None:
         for kind, shard in actions:
             owner = f"{self._prefix}/owners/{shard}"
             if kind == "offer":
@@ -196,7 +191,7 @@ class Group:
                 await client.publish(owner, shares.name.encode(), qos=1, retain=True)
             elif kind == "begin":
                 found = self._work_on(shard)
-                await client.subscribe(self._topic_of[shard], qos=self._broker.qos)
+                await client.subscribe([self._topic_of[shard]], self._broker.qos)
                 self._tell_taken(shard, found)
             else:
                 await client.unsubscribe(self._topic_of[shard])
