@@ -1,9 +1,11 @@
 """The event log: everything once, nothing changed, and what happens when it cannot be written."""
 
+import asyncio
 import sqlite3
 
 import pytest
 
+from brokers import until
 from holdfast.shell.errors import InputError
 from holdfast.shell.service.event_log import PENDING, EventLog
 from live_rows import alarm, row
@@ -56,6 +58,14 @@ def test_events_are_on_the_disk_soon(log, other, monkeypatch):
 
 
 @pytest.mark.parametrize("table", ["events", "acknowledgements"])
+def test_an_event_need_not_wait_for_a_row(log, other):
+    async def play():
+        log.event(alarm(1))
+        await until(lambda: other.execute("SELECT count(*) FROM events").fetchone() == (1,))
+
+    asyncio.run(play())
+
+
 @pytest.mark.parametrize("change", ["UPDATE {} SET id = 7", "DELETE FROM {}"])
 def test_nothing_is_changed_or_removed(log, other, table, change):
     log.event(alarm(1))

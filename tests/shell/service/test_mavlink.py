@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import json
 import math
 import socket
 import time
@@ -165,3 +166,17 @@ def test_what_there_is_not(signal, expected):
         source(signals={"y:north": signal})
     assert str(caught.value).startswith(f"live.toml: source[1].signals.{signal}: found ")
     assert expected in str(caught.value)
+
+
+def test_after_a_restart_nothing_is_accepted_twice():
+    """What was sent in the last minute is not too old: the checkpoint has to know of it."""
+    sender, found = vehicle(KEY), source(KEY)
+    frames = [position(float(k)).pack(sender) for k in range(3)]
+    assert len(taken_of(found, *frames)) == 3
+    again = source(KEY)
+    again.restore(json.loads(json.dumps(found.held())))
+    assert taken_of(again, *frames) == []
+    assert again.counters.rejected == 3
+    assert len(taken_of(again, position(4.0).pack(sender))) == 1
+    assert len(taken_of(source(KEY), *frames)) == 3  # as it is without
+    assert source().held() is None

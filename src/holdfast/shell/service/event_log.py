@@ -5,6 +5,8 @@ restart writes nothing twice; `acknowledgements` says who has seen which. Trigge
 or remove a line of either, or to put another in its place.
 """
 
+import asyncio
+import contextlib
 import datetime
 import math
 import sqlite3
@@ -79,13 +81,19 @@ class EventLog(Sink):
         if time.monotonic() >= self._due:
             self.flush()
 
+    def _wait(self, seconds: float) -> None:
+        """Write then: with the next row, or by the clock where no more rows come."""
+        self._due = time.monotonic() + seconds
+        with contextlib.suppress(RuntimeError):  # nobody waits where there is no event loop
+            asyncio.get_running_loop().call_later(1.1 * seconds, self.row, None)
+
     def event(self, event: Event) -> None:
         """Take an event; it is written soon."""
         if len(self._pending) >= PENDING:
             self.lost += 1
             return
         if not self._pending:
-            self._due = time.monotonic() + SOON
+            self._wait(SOON)
         self._pending.append(event)
         if len(self._pending) >= AT_ONCE and not self.trouble:
             self.flush()
@@ -109,7 +117,7 @@ class EventLog(Sink):
                 )
         except sqlite3.Error as error:
             self.trouble = f"the event log cannot be written: {error}"
-            self._due = time.monotonic() + AGAIN
+            self._wait(AGAIN)
             return
         self._pending.clear()
         self.trouble = ""

@@ -76,6 +76,15 @@ class MavlinkSource(Source):
             self.counters.disconnects += 1
             await asyncio.sleep(backoff.pause())
 
+    def held(self) -> Any:
+        """The newest signatures accepted of every stream."""
+        return None if self._signatures is None else self._signatures.held()
+
+    def restore(self, held: Any) -> None:
+        """Go on from a checkpoint: what was accepted before it is not accepted again."""
+        if self._signatures is not None:
+            self._signatures.restore(held)
+
     def _datagram(self, data: bytes, take: Take) -> None:
         for frame in _frames(data) if len(data) <= DATAGRAM else (None,):
             self.counters.messages += 1
@@ -119,24 +128,38 @@ class _Signatures:
             raise InputError(file, key, "no package for signatures", expected) from None
         self._ring = KeyRing.of(key_bytes)
         # what is not authentic leaves no trace, so nobody else can make it grow
-        self._streams: dict[tuple[int, int, int], tuple[Any, Any]] = {}
+        self._states: dict[tuple[int, int, int], Any] = {}
+        self._verifiers: dict[tuple[int, int, int], Any] = {}
+
+    def held(self) -> list[list[Any]]:
+        """Of every stream its name, its own timestamp, and the newest of each link."""
+        return [
+            [*stream, state.own, [*state.links.items()]] for stream, state in self._states.items()
+        ]
+
+    def restore(self, held: list[list[Any]]) -> None:
+        """Go on from there."""
+        from holdfast.auth.mavlink import VerifierState
+
+        for system, component, kind, own, links in held:
+            stamps = {int(link): int(stamp) for link, stamp in links}
+            self._states[int(system), int(component), int(kind)] = VerifierState(int(own), stamps)
 
     def authentic(self, frame: bytes, kind: Any) -> bool | None:
         """Whether a frame is signed rightly, for the first time; None if it claims to be."""
         from holdfast.auth import MavlinkVerifier, Outcome
 
         stream = frame[5], frame[6], kind.id
-        known = self._streams.get(stream)
-        if known is None:
+        verifier = self._verifiers.get(stream)
+        if verifier is None:
             verifier = MavlinkVerifier(self._ring, *stream, kind.crc_extra, kind.unpacker.size)
-            known = verifier, verifier.start()
-        verifier, state = known
+        state = self._states.get(stream) or verifier.start()
         state, opened = verifier.open(state, frame, int((time.time() - EPOCH) * 1e5))
         if opened.outcome is Outcome.UNSIGNED:
             return False
         if opened.outcome is not Outcome.AUTHENTIC:
             return None
-        self._streams[stream] = verifier, state
+        self._states[stream], self._verifiers[stream] = state, verifier
         return True
 
 

@@ -146,8 +146,9 @@ class Service:
             sink.flush()
         words, arrays = self._engine.held()
         positions = {source.name: source.position for source in self._sources}
-        head = {"version": __version__, "positions": positions, "engine": words,
-                "written": time.time()}  # fmt: skip
+        beside = {source.name: source.held() for source in self._sources}
+        head = {"version": __version__, "positions": positions, "sources": beside,
+                "engine": words, "written": time.time()}  # fmt: skip
         try:
             write_checkpoint(self._config.folder / keys.file, self._owner, head, arrays)
         except InputError as error:
@@ -169,6 +170,9 @@ class Service:
             position = words["positions"].get(source.name)
             if position is not None and source.position is not None:
                 source.resume(position)
+            held = words.get("sources", {}).get(source.name)
+            if held is not None:
+                source.restore(held)
         return True
 
     def _greet(self, resumed: bool) -> None:

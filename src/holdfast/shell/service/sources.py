@@ -3,6 +3,7 @@
 import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from typing import Any
 
 from holdfast.shell.service.records import Samples
 
@@ -46,3 +47,11 @@ class Source(ABC):
     def resume(self, position: int) -> None:
         """Start after this position. Called before `run`, where ``position`` is not None."""
         raise NotImplementedError(f"{self.name} cannot go back")
+
+    def held(self) -> Any:
+        """What a checkpoint keeps beside the position, as JSON has it."""
+        return None
+
+    def restore(self, held: Any) -> None:
+        """Go on from a checkpoint that kept something. Called before `run`."""
+        raise NotImplementedError(f"{self.name} keeps nothing")
