@@ -57,7 +57,6 @@ def test_events_are_on_the_disk_soon(log, other, monkeypatch):
     assert other.execute("SELECT count(*) FROM events").fetchone() == (1,)
 
 
-@pytest.mark.parametrize("table", ["events", "acknowledgements"])
 def test_an_event_need_not_wait_for_a_row(log, other):
     async def play():
         log.event(alarm(1))
@@ -66,6 +65,7 @@ def test_an_event_need_not_wait_for_a_row(log, other):
     asyncio.run(play())
 
 
+@pytest.mark.parametrize("table", ["events", "acknowledgements"])
 @pytest.mark.parametrize("change", ["UPDATE {} SET id = 7", "DELETE FROM {}"])
 def test_nothing_is_changed_or_removed(log, other, table, change):
     log.event(alarm(1))
