@@ -8,6 +8,7 @@ just before a frame is published to when its estimate has been received here.
 
 import contextlib
 import json
+import os
 import shutil
 import socket
 import subprocess
@@ -46,6 +47,15 @@ port = {port}
 kind = "mqtt"
 port = {port}
 prefix = "out"
+"""
+
+
+START = """\
+scenario = "plant.toml"
+[[source]]
+kind = "stdin"
+[[sink]]
+kind = "stdout"
 """
 
 
@@ -133,9 +143,39 @@ def case(name, rate, seconds, outputs, messages, topics):
     print(f"{name}: {count} frames sent, {count - len(late)} lost, {told}", flush=True)
 
 
+def starts(repeat=5):
+    """Seconds from the start of the process to its first estimate, without and with compiled code
+    on disk.
+    """
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        C, R = rows(4)
+        (folder / "plant.toml").write_text(PLANT.format(dt=0.1, C=C, R=R))
+        (folder / "live.toml").write_text(START)
+        environment = os.environ | {"HOLDFAST_CACHE": str(folder / "cache")}
+        holdfast = Path(sys.executable).with_name("holdfast")
+        row = json.dumps({"time": 0.1, **{f"y:y{i + 1}": 0.0 for i in range(4)}}) + "\n"
+        found = []
+        for _ in range(1 + repeat):
+            begun = time.perf_counter()
+            with subprocess.Popen(
+                [holdfast, "live", folder / "live.toml"], env=environment, text=True,
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            ) as running:  # fmt: skip
+                running.stdin.write(row)
+                running.stdin.flush()
+                while "status" not in json.loads(running.stdout.readline()):
+                    pass  # the event that the service has started
+                found.append(time.perf_counter() - begun)
+                running.stdin.close()
+    told = f"{min(found[1:]):.2f} to {max(found[1:]):.2f} s with compiled code on disk"
+    print(f"start to first estimate: {found[0]:.2f} s without, {told}", flush=True)
+
+
 def main():
-    """Whole rows at three rates, and twenty signals of their own."""
+    """Start; whole rows at three rates, and twenty signals of their own."""
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 60.0
+    starts()
 
     def whole(stamp, values):
         return [("in", json.dumps({"time": stamp, **{f"y:y{i + 1}": values[i] for i in range(4)}}))]

@@ -5,8 +5,6 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import linear_sum_assignment
-from scipy.signal import place_poles
 
 from holdfast.controllers.feedback import Feedback, held, steered
 from holdfast.numerics.subspaces import TOLERANCE, complement, modes, scaled, silent
@@ -63,6 +61,8 @@ def placed(A: np.ndarray, B: np.ndarray, poles: np.ndarray) -> np.ndarray:
             f"{_text(often)} {np.max(counts)} times",
             f"each pole at most {rank} times, the rank of B",
         )
+    from scipy.signal import place_poles  # takes longer to import than JAX
+
     # the solver takes the columns of B to be independent
     used = right[:rank].T
     try:
@@ -83,6 +83,8 @@ def placed(A: np.ndarray, B: np.ndarray, poles: np.ndarray) -> np.ndarray:
 
 def distance(found: np.ndarray, asked: np.ndarray) -> float:
     """The largest distance between two sets of poles (n,), paired so that their sum is least."""
+    from scipy.optimize import linear_sum_assignment  # takes as long to import as JAX
+
     apart = np.abs(found[:, None] - asked)
     return float(np.max(apart[linear_sum_assignment(apart)]))
 

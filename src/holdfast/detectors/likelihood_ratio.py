@@ -6,7 +6,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from scipy.optimize import root_scalar
 from scipy.special import chdtrc
 
 from holdfast.detectors.settings import (
@@ -20,6 +19,7 @@ from holdfast.detectors.settings import (
 from holdfast.numerics.limits import Limited
 from holdfast.numerics.linalg import dot, lower_factor, mahalanobis
 from holdfast.numerics.projection import project
+from holdfast.numerics.roots import bracketed_root
 from holdfast.parts import Detector, InvalidValue, Plant
 from holdfast.records import Estimate, Reason, Verdict
 
@@ -128,4 +128,4 @@ def _half_and_half(level: float, rank: int) -> float:
 
     if excess(0.0) <= 0:
         return 0.0
-    return float(root_scalar(excess, bracket=(0.0, 1e4), xtol=1e-13).root)
+    return bracketed_root(excess, (0.0, 1e4), xtol=1e-13)

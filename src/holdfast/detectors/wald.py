@@ -7,10 +7,9 @@ again at 0 whenever it leaves (-h, h), so alarms form a renewal process.
 from collections.abc import Callable
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.optimize import root_scalar
 from scipy.special import chdtr, chdtri, hyp0f1
 
+from holdfast.numerics.roots import bracketed_root
 from holdfast.parts import InvalidValue
 
 CELLS = 201
@@ -22,6 +21,8 @@ def increments(shift: float, dof: int) -> tuple[Callable, float, float]:
 
     F is its distribution function, ``low`` its least value, ``sd`` its standard deviation.
     """
+    from scipy.interpolate import CubicSpline  # takes long to import
+
     root = np.linspace(0.0, np.sqrt(chdtri(dof, 1e-15)), 2000)
     value = np.log(hyp0f1(dof / 2.0, (shift * root) ** 2 / 4.0)) - shift**2 / 2.0
     # the statistic is a smooth function of its ratio; its distribution function is not
@@ -67,8 +68,7 @@ def boundary(level: float, shift: float, dof: int) -> float:
     distribution, low, sd = increments(shift, dof)
     if alarm_rate(0.0, distribution) <= level:
         # even one row rarely passes 0: the test of a single row, which has this level
-        single = root_scalar(lambda h: alarm_rate(h, distribution) - level, bracket=(low, 0.0))
-        return float(single.root)
+        return bracketed_root(lambda h: alarm_rate(h, distribution) - level, (low, 0.0))
     # the cells must resolve one row's step
     cells = CELLS
     high = 8.0 * sd
@@ -85,4 +85,4 @@ def boundary(level: float, shift: float, dof: int) -> float:
     def excess(h: float) -> float:
         return float(np.log(alarm_rate(h, distribution, cells) / level))
 
-    return float(root_scalar(excess, bracket=(1e-6 * sd, high), rtol=1e-6).root)
+    return bracketed_root(excess, (1e-6 * sd, high), rtol=1e-6)

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtri, ndtri
-from scipy.stats import rankdata
 
 from holdfast.numerics.linalg import mahalanobis
 
@@ -293,6 +292,8 @@ def roc(statistic: ArrayLike, attacked: ArrayLike, *, confidence: float = 0.95) 
     rows taken as independent, NaN with fewer than two rows of a kind.
     Source: DeLong, DeLong, Clarke-Pearson, Biometrics 44 (1988).
     """
+    from scipy.stats import rankdata  # takes as long to import as JAX
+
     statistic, attacked = np.ravel(np.asarray(statistic, float)), np.ravel(np.asarray(attacked))
     used = ~np.isnan(statistic)
     statistic, attacked = statistic[used], attacked[used].astype(bool)

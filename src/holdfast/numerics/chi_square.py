@@ -8,8 +8,9 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from scipy.optimize import root_scalar
 from scipy.special import chdtri, hyp0f1, ndtri
+
+from holdfast.numerics.roots import bracketed_root
 
 NODES = 120
 SLOPE = 0.7
@@ -114,7 +115,7 @@ def _saddle(
     low = -(0.5 * np.sum(nu) + 0.125 * np.sum(shift2) + 2.0) / x
     upper = x > w @ (nu + shift2)
     bracket = (edge * 1e-15, edge * (1 - 1e-15)) if upper else (low, -edge * 1e-15)
-    saddle = float(root_scalar(slope, bracket=bracket, xtol=1e-14 * edge).root)
+    saddle = bracketed_root(slope, bracket, xtol=1e-14 * edge)
     spread = w / (1.0 - 2.0 * w * saddle)
     k2 = float(2.0 * (spread**2 @ nu + 2.0 * (spread**3 / w) @ shift2) + saddle**-2)
     k3 = float(8.0 * (spread**3 @ nu + 3.0 * (spread**4 / w) @ shift2))
@@ -136,7 +137,7 @@ def weighted_quantile(level: float, weights: np.ndarray, dof: np.ndarray) -> flo
 
     # either end may be the quantile itself, where the tail's rounding decides the sign
     bracket = (low * (1 - 1e-6), high * (1 + 1e-6))
-    return float(root_scalar(excess, bracket=bracket, rtol=1e-12).root)
+    return bracketed_root(excess, bracket, rtol=1e-12)
 
 
 class SumQuantile(eqx.Module):

@@ -11,11 +11,10 @@ difference of two nearly equal probabilities. NumPy on the host, when things are
 import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
-from scipy.optimize import root_scalar
 from scipy.special import chdtr, chdtrc, gammaln, ive, ndtri
 
 from holdfast.numerics.chi_square import weighted_rise, weighted_tails
+from holdfast.numerics.roots import bracketed_root
 
 NODES = 40
 ROWS = 512
@@ -241,6 +240,8 @@ def alphas(epsilon: float, dofs: np.ndarray, thresholds: np.ndarray) -> np.ndarr
         at = at[np.unique(dof[at], return_index=True)[1]]
         if len(at) > 3:
             few = np.log(_solve(epsilon, dof[at], x[at]))
+            from scipy.interpolate import CubicSpline  # takes long to import
+
             start = np.exp(CubicSpline(np.log(dof[at]), few)(np.log(dof)))
     found = np.empty(len(x))
     found[order] = _solve(epsilon, dof, x, start)
@@ -296,4 +297,4 @@ def largest_shift(
     low = high - 5.0
     while gap(low) > 0:
         low -= 5.0
-    return float(np.exp(root_scalar(gap, bracket=(low, high), xtol=1e-13).root))
+    return float(np.exp(bracketed_root(gap, (low, high), xtol=1e-13)))

@@ -42,7 +42,10 @@ class FlatMonitor:
         self._nu, self._ny = len(plant.inputs), len(plant.outputs)
         state = (monitor.init(), jnp.zeros(self._nu))
         self._slots, self._tree = _layout(state)
-        self.start = np.asarray(_pack(state))
+        # by NumPy: JAX would compile a program for every shape
+        self.start = np.concatenate(
+            [np.ravel(leaf).astype(float) for leaf in jax.tree.leaves(state)]
+        )
         outcome = jax.eval_shape(self._outcome, state, np.zeros(self.sample_size))[1]
         slots, _ = _layout(outcome)
         self.outcome_size = slots[-1].stop

@@ -19,7 +19,7 @@ state.
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri
 
 HEALTHY, SUSPECTED, ISOLATED, PROBATION = "healthy", "suspected", "isolated", "probation"
 
@@ -44,7 +44,7 @@ class Rules(NamedTuple):
     @property
     def threshold(self) -> float:
         """What the mean of ``window`` squared innovations exceeds with probability ``level``."""
-        return float(stats.chi2.isf(self.level, self.window)) / self.window
+        return float(chdtri(self.window, self.level)) / self.window
 
 
 class Health:
