@@ -6,15 +6,15 @@ A Mosquitto, `holdfast live`, this sender and listener share the machine. Each p
 and four sensors; ten gateways send a batch of 1,000 plants every 0.1 s, one after the other.
 """
 
-import asyncio
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 
-import aiomqtt
 import numpy as np
+from lean_mqtt import Client
 from live import PLANT, broker, rows
 
 from holdfast.shell import runtime
@@ -79,48 +79,36 @@ def alone(path):
           f"second of processor time: {rate * DT:,.0f} plants at 10 Hz", flush=True)  # fmt: skip
 
 
-async def measured(port, seconds):
+def measured(port, seconds):
     """Send for so long; how many rows came back, and how late."""
     begun, late, counted = {}, [], set()
-    stop = asyncio.Event()
+    listener, sender = Client(port), Client(port)
+    listener.subscribe("out/estimates")
 
-    def client():
-        return aiomqtt.Client("127.0.0.1", port, max_queued_outgoing_messages=0)
+    def listen():
+        for payload in listener.messages(timeout=5.0):
+            now, found = time.perf_counter(), read_estimates(payload)
+            row = round(float(found.time[0]) / DT)
+            gateway = int(found.ids[0]) // (PLANTS // GATEWAYS)
+            whole = np.all((found.status & 1) == 0) and len(found.ids) == PLANTS // GATEWAYS
+            if (row, gateway) in begun and whole:
+                late.append(now - begun[row, gateway])
+                counted.add((row, gateway))
 
-    async def listen(ready):
-        async with client() as listening:
-            await listening.subscribe("out/estimates")
-            ready.set()
-            async for message in listening.messages:
-                now, found = time.perf_counter(), read_estimates(message.payload)
-                row = round(float(found.time[0]) / DT)
-                gateway = int(found.ids[0]) // (PLANTS // GATEWAYS)
-                whole = np.all((found.status & 1) == 0) and len(found.ids) == PLANTS // GATEWAYS
-                if (row, gateway) in begun and whole:
-                    late.append(now - begun[row, gateway])
-                    counted.add((row, gateway))
-                if stop.is_set():
-                    return
-
-    ready = asyncio.Event()
-    listening = asyncio.create_task(listen(ready))
-    await ready.wait()
+    listening = threading.Thread(target=listen)
+    listening.start()
     count, warm = round(seconds / DT), 20
-    async with client() as sender:
-        start = time.perf_counter()
-        for k in range(1, warm + count + 1):
-            for i, batch in enumerate(batches(k)):
-                wait = start + (k + i / GATEWAYS) * DT - time.perf_counter()
-                message = batch_frame(batch)
-                if wait > 0:
-                    await asyncio.sleep(wait)
-                if k > warm:
-                    begun[k, i] = time.perf_counter()
-                await sender.publish(f"in/{i}", message)
-        await asyncio.sleep(2.0)
-    stop.set()
-    listening.cancel()
-    await asyncio.gather(listening, return_exceptions=True)
+    start = time.perf_counter()
+    for k in range(1, warm + count + 1):
+        for i, batch in enumerate(batches(k)):
+            wait = start + (k + i / GATEWAYS) * DT - time.perf_counter()
+            message = batch_frame(batch)
+            if wait > 0:
+                time.sleep(wait)
+            if k > warm:
+                begun[k, i] = time.perf_counter()
+            sender.publish(f"in/{i}", message)
+    listening.join()
     return count * GATEWAYS, len(counted), np.sort(late)
 
 
@@ -134,7 +122,7 @@ def main():
         running = subprocess.Popen([Path(sys.executable).with_name("holdfast"), "live", path])
         try:
             time.sleep(20)
-            sent, back, late = asyncio.run(measured(port, seconds))
+            sent, back, late = measured(port, seconds)
         finally:
             running.terminate()
             running.wait()

@@ -165,6 +165,20 @@ def test_the_command_line_does_not_wait_for_jax():
     assert done.stdout.strip() == "[]"
 
 
+BENCHMARKS = sorted((Path(__file__).parents[1] / "benchmarks").glob("*.py"))
+
+
+@pytest.mark.parametrize("path", BENCHMARKS, ids=lambda path: path.stem)
+def test_benchmarks_ask_for_what_there_is(path):
+    """Nobody runs them every day: what they import must not have moved away."""
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("holdfast"):
+            module = importlib.import_module(node.module)
+            for alias in node.names:
+                if not hasattr(module, alias.name):
+                    importlib.import_module(f"{node.module}.{alias.name}")
+
+
 def public(node):
     return not node.name.startswith("_")
 
