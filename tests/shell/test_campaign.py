@@ -91,6 +91,8 @@ def test_a_run_alone_is_the_run_of_the_campaign(ran, study):
     for point, number in ((0, 0), (1, 255), (1, 599)):
         case, key = prepared.cases[point], prepared.keys[point]
         trace = single(case, key, number)
+        kept = sum(leaf.nbytes for leaf in jax.tree.leaves(trace))
+        assert found.attrs["bytes_per_step"] == pytest.approx(kept / case.steps)
         error = np.asarray(trace.estimate.x - trace.x)
         ours = found.state_rmse.isel({"attack.value": point, "run": number}).values
         np.testing.assert_allclose(ours, np.sqrt(np.mean(error**2, 0)), rtol=1e-12)

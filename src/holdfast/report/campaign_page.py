@@ -22,6 +22,8 @@ HIGHER = ("detected_share", "mode_accuracy", "localisation_precision", "localisa
 ATTRIBUTES = {
     "scenario": "Scenario", "points": "Points", "runs": "Runs of each point",
     "steps": "Steps of each run", "seed": "Seed", "holdfast": "Version of holdfast",
+    "microseconds_per_step": "Microseconds a step of a run took, compiling included",
+    "bytes_per_step": "Bytes that the record of a step takes while it is worked on",
 }  # fmt: skip
 LISTED = 12
 """Values of an axis that are listed."""
@@ -80,12 +82,18 @@ def _names(found: xr.Dataset) -> list[str]:
 
 def _attributes(found: xr.Dataset) -> Markup:
     """What the campaign was run with, and the command that runs it again."""
-    rows = [[said, str(found.attrs[k])] for k, said in ATTRIBUTES.items() if k in found.attrs]
+    given = {k: found.attrs[k] for k in ATTRIBUTES if k in found.attrs}
+    # no time where nothing was run: NaN
+    rows = [[ATTRIBUTES[k], _value(value)] for k, value in given.items() if value == value]
     parts = [table([Column("Setting"), Column("Value")], rows)] if rows else []
     if found.attrs.get("command"):
         above = element("p", "The command that runs it again:", class_="caption")
         parts += [above, element("pre", str(found.attrs["command"]), tabindex="0")]
     return join(parts)
+
+
+def _value(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _axes(found: xr.Dataset) -> Markup:

@@ -228,6 +228,7 @@ def _attrs(
         "command": f"holdfast campaign {Path(study.path).name}"
         + ("" if output is None else f" -o {Path(output).name}"),
         "microseconds_per_step": 1e6 * seconds / (made * steps) if made else math.nan,
+        "bytes_per_step": block_bytes(prepared) / (BLOCK * steps),
     }
 
 
