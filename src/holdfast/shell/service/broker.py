@@ -7,8 +7,8 @@ import logging
 import socket
 import ssl
 import sys
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable, Coroutine, Iterable
+from typing import Any, TypeVar
 
 from holdfast.shell.errors import InputError
 from holdfast.shell.service.limits import Backoff
@@ -19,6 +19,7 @@ KEPT = 3600
 REFUSED = 128
 """Reason codes from which on the broker has said no."""
 
+Result = TypeVar("Result")
 Handle = Callable[[str, bytes], None]
 """Takes a message's topic and what it holds."""
 
@@ -96,17 +97,29 @@ class Connection:
     async def __aexit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         from aiomqtt import MqttError
 
+        ours = self._failure
+        if ours is not None:
+            # without a farewell, after which the broker would not say our will; aiomqtt takes it
+            # for closed, and it would be read for ever
+            self._paho._sock_close()
         try:
             await self._client.__aexit__(kind, error, trace)
         except (MqttError, OSError) as beside:
             error = error or beside
+        finally:
+            ended = self._client._disconnected
+            if ended.done() and not ended.cancelled():
+                ended.exception()  # or asyncio prints what nobody asked for
+        # whoever cancels us wants no more
+        if ours is not None and (error is None or isinstance(error, Exception)):
+            raise ours
         if isinstance(error, MqttError | OSError):
             raise Broken(_words(error.__cause__ or error)) from None
 
     async def subscribe(self, topics: Iterable[str], qos: int) -> None:
         """Ask for messages. Raises `Broken` for a topic that the broker refuses."""
         for topic in topics:
-            for code in await self._client.subscribe(topic, qos=qos):
+            for code in await self.unless_gone(self._client.subscribe(topic, qos=qos)):
                 if getattr(code, "value", code) >= REFUSED:
                     raise Broken(f"no right to subscribe to {topic}: {code}")
 
@@ -131,16 +144,32 @@ class Connection:
     async def gone(self) -> None:
         """Wait until the connection breaks, which it always does by raising."""
         try:
-            async for _ in self._client.messages:
-                pass
+            # a fault may have come with the connection itself, and of that aiomqtt tells nobody
+            while self._failure is None:
+                await anext(self._client.messages)
         finally:
             if self._failure is not None:
                 raise self._failure
+
+    async def unless_gone(self, doing: Coroutine[Any, Any, Result]) -> Result:
+        """Do something that waits for the broker; raises as `gone` where that comes first."""
+        task, gone = asyncio.create_task(doing), asyncio.create_task(self.gone())
+        try:
+            await asyncio.wait((task, gone), return_when=asyncio.FIRST_COMPLETED)
+            if gone.done():
+                gone.result()
+            return task.result()
+        finally:
+            task.cancel()
+            gone.cancel()
+            await asyncio.gather(task, gone, return_exceptions=True)
 
     def _wants_to_write(self, client: Any, data: Any, sock: socket.socket) -> None:
         asyncio.get_running_loop().add_writer(sock.fileno(), self.write)
 
     def _received(self, client: Any, data: Any, message: Any) -> None:
+        if self._failure is not None:
+            raise self._failure  # paho offers the same message again until it is closed
         try:
             topic = message.topic
         except UnicodeDecodeError:
@@ -148,7 +177,7 @@ class Connection:
         try:
             self._handle(topic, message.payload)
         except Exception as error:
-            # paho takes it for a broken connection
+            # paho takes it for a broken connection, and the broker keeps the message
             self._failure = error
             raise
 
