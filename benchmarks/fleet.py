@@ -6,6 +6,7 @@ A Mosquitto, `holdfast live`, this sender and listener share the machine. Each p
 and four sensors; ten gateways send a batch of 1,000 plants every 0.1 s, one after the other.
 """
 
+import math
 import subprocess
 import sys
 import tempfile
@@ -15,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from lean_mqtt import Client
-from live import PLANT, broker, rows
+from live import PATIENCE, PLANT, broker, rows
 
 from holdfast.shell import runtime
 from holdfast.shell.service.config import read_config
@@ -81,12 +82,12 @@ def alone(path):
 
 def measured(port, seconds):
     """Send for so long; how many rows came back, and how late."""
-    begun, late, counted = {}, [], set()
+    begun, late, counted, end = {}, [], set(), math.inf
     listener, sender = Client(port), Client(port)
     listener.subscribe("out/estimates")
 
     def listen():
-        for payload in listener.messages(timeout=5.0):
+        for payload in listener.messages(lambda: time.perf_counter() < end):
             now, found = time.perf_counter(), read_estimates(payload)
             row = round(float(found.time[0]) / DT)
             gateway = int(found.ids[0]) // (PLANTS // GATEWAYS)
@@ -108,6 +109,7 @@ def measured(port, seconds):
             if k > warm:
                 begun[k, i] = time.perf_counter()
             sender.publish(f"in/{i}", message)
+    end = time.perf_counter() + PATIENCE
     listening.join()
     return count * GATEWAYS, len(counted), np.sort(late)
 

@@ -43,11 +43,11 @@ class Client:
         """Send one message."""
         self._socket.sendall(_packet(0x30, _text(topic) + b"\0" + payload))
 
-    def messages(self, timeout):
-        """Payloads as they come, until none has come for ``timeout`` seconds."""
-        self._socket.settimeout(timeout)
+    def messages(self, go_on):
+        """Payloads as they come, as long as ``go_on()``."""
+        self._socket.settimeout(2.0)
         try:
-            while True:
+            while go_on():
                 kind, body = self._read()
                 if kind & 0xF0 == 0x30:
                     length = struct.unpack_from(">H", body)[0]

@@ -8,6 +8,7 @@ just before a frame is published to when its estimate has been received here.
 
 import contextlib
 import json
+import math
 import os
 import shutil
 import socket
@@ -50,6 +51,8 @@ prefix = "out"
 """
 
 
+PATIENCE = 5.0
+"""Seconds after the last frame in which what is on its way may still come."""
 START = """\
 scenario = "plant.toml"
 [[source]]
@@ -88,22 +91,23 @@ def broker(folder):
 
 def measure(port, rate, seconds, messages):
     """Send ``rate`` frames a second; how many, and how late what came back was."""
-    sent, late = {}, []
-    values = np.random.default_rng(0).normal(size=(1000, 64))
+    sent, late, end = {}, [], math.inf
+    values = np.random.default_rng(0).normal(scale=0.5, size=(1000, 64))  # as R says
     listener, sender = Client(port), Client(port)
     listener.subscribe("out/estimate")
 
     def listen():
-        for payload in listener.messages(timeout=5.0):
+        for payload in listener.messages(lambda: time.perf_counter() < end and len(late) < count):
             now = time.perf_counter()
             begun = sent.get(round(json.loads(payload)["time"] * rate))
             if begun is not None:
                 late.append(now - begun)
 
+    warm, count = 3 * rate, int(rate * seconds)
     listening = threading.Thread(target=listen)
     listening.start()
     # frames until the service has surely subscribed and compiled
-    begin, warm, count = time.perf_counter(), 3 * rate, int(rate * seconds)
+    begin = time.perf_counter()
     for k in range(warm + count):
         wait = begin + k / rate - time.perf_counter()
         if wait > 0:
@@ -114,6 +118,7 @@ def measure(port, rate, seconds, messages):
         for topic, payload in found:
             sender.publish(topic, payload.encode())
     behind = time.perf_counter() - begin - (warm + count) / rate
+    end = time.perf_counter() + PATIENCE
     listening.join()
     if behind > 0.1:
         print(f"the sender was {behind:.1f} s behind at the end", flush=True)

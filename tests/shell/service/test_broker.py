@@ -1,44 +1,32 @@
 """Brokers that want to know who we are, refuse us, keep our messages, or meet a fault of ours."""
 
 import asyncio
-import getpass
-import shutil
 import ssl
-import subprocess
 
 import pytest
 
-from brokers import Mosquitto, until
+from brokers import Mosquitto, certified, passwords, readable, until
 from holdfast.shell.service.broker import Broker
 from holdfast.shell.service.mqtt import MqttSink, MqttSource, said_of
 from holdfast.shell.service.wire import single
-from live_rows import LABELS, row
+from live_rows import LABELS, alarm, row
 
 SECRET = "correct horse battery staple"
 
 
-def program_of(name):
-    """Where a program is that not everybody has."""
-    return shutil.which(name) or pytest.skip(f"no {name}: install the distribution's package")
-
-
-def mosquitto(folder, *lines):
-    """A broker with these lines of configuration, and with the right to read a test's files."""
-    found = Mosquitto(folder)
-    found.configure(f"user {getpass.getuser()}", *(lines or ["allow_anonymous true"]))
-    return found.start()
+@pytest.fixture
+def broker(tmp_path):
+    """A broker that is stopped whatever happens."""
+    found = Mosquitto(tmp_path)
+    yield found
+    found.stop()
 
 
 @pytest.fixture
-def guarded(tmp_path):
+def guarded(tmp_path, broker):
     """A broker that knows one user."""
-    passwords = tmp_path / "passwords"
-    subprocess.run(
-        [program_of("mosquitto_passwd"), "-b", "-c", str(passwords), "us", SECRET], check=True
-    )
-    found = mosquitto(tmp_path, "allow_anonymous false", f"password_file {passwords}")
-    yield found
-    found.stop()
+    broker.configure(*passwords(tmp_path, "us", SECRET))
+    return broker.start()
 
 
 def source_of(broker, topic="in"):
@@ -121,88 +109,166 @@ def test_a_topic_that_is_refused_is_no_connection(capfd):
     assert told.count("no right to subscribe to in: Not authorized; trying again") == 1
 
 
-def test_what_a_fault_of_ours_raises_is_not_lost(tmp_path):
-    """Not taken for a broken connection, after which all would go on without the message."""
-    broker = mosquitto(tmp_path)
-
-    def take(_):
-        raise ZeroDivisionError("a fault of ours")
+def test_a_topic_that_is_refused_is_had_when_the_right_is_given(tmp_path, broker, capfd):
+    broker.configure(*readable(tmp_path, "else"))
+    broker.start()
 
     async def play():
-        here = Broker(port=broker.port)
-        source = source_of(here)
-        task = asyncio.create_task(source.run(take))
-        await until(lambda: source.connected)
-        async with here.connection(lambda *_: None) as sender:
-            await sender.publish("in", b"1.5", 0)
-            async with asyncio.timeout(10):
-                await task
-
-    try:
-        with pytest.raises(ZeroDivisionError, match="a fault of ours"):
-            asyncio.run(play())
-    finally:
+        source = source_of(Broker(port=broker.port))
+        task = asyncio.create_task(source.run(lambda _: None))
+        await until(lambda: source.counters.disconnects >= 2)
         broker.stop()
+        readable(tmp_path, "in")
+        broker.start()
+        await until(lambda: source.connected)
+        await cancelled(task)
+
+    asyncio.run(play())
+    told = capfd.readouterr().err
+    assert told.count("no right to subscribe to in: Not authorized; trying again") == 1
+    assert told.endswith(": connected\n")
 
 
-def test_what_comes_while_we_are_away_is_kept(tmp_path):
+def failing(calls):
+    """What takes messages, and is broken."""
+
+    def take(_):
+        calls.append(None)
+        raise ZeroDivisionError("a fault of ours")
+
+    return take
+
+
+async def sent(broker, numbers):
+    """Numbers to the topic "in", with qos 1."""
+    async with Broker(port=broker.port).connection(lambda *_: None) as sender:
+        for number in numbers:
+            await sender.publish("in", f"{number}".encode(), 1)
+
+
+def test_what_a_fault_of_ours_raises_is_not_lost(broker, capfd):
+    """Not taken for a broken connection, after which all would go on without the message."""
+    broker.start()
+    calls = []
+
+    async def play():
+        source = source_of(Broker(port=broker.port))
+        task = asyncio.create_task(source.run(failing(calls)))
+        await until(lambda: source.connected)
+        await sent(broker, range(3))
+        async with asyncio.timeout(10):
+            await task
+
+    with pytest.raises(ZeroDivisionError, match="a fault of ours"):
+        asyncio.run(play())
+    assert len(calls) == 1
+    assert capfd.readouterr().err == ""
+
+
+def test_a_fault_in_messages_that_were_kept_is_not_lost(broker, capfd):
+    """They come with the connection itself, before the topics have been asked for again."""
+    broker.start()
+    us = Broker(port=broker.port, client_id="holdfast-1", qos=1)
+    calls, taken = [], []
+
+    async def play():
+        source = source_of(us)
+        task = asyncio.create_task(source.run(taken.append))
+        await until(lambda: source.connected)
+        await cancelled(task)
+        await sent(broker, range(3))
+        with pytest.raises(ZeroDivisionError):
+            async with asyncio.timeout(5):
+                await source_of(us).run(failing(calls))
+        # nobody has said that it was had
+        task = asyncio.create_task(source_of(us).run(taken.append))
+        await until(lambda: len(taken) == 3)
+        await cancelled(task)
+
+    asyncio.run(play())
+    assert len(calls) == 1
+    assert [one.values["y:gps"] for one in taken] == [0, 1, 2]
+    assert capfd.readouterr().err == ""
+
+
+async def closing(reader, writer):
+    """A broker that lets everybody in and out at once."""
+    await reader.readuntil(b"MQTT")
+    writer.write(bytes.fromhex("20 03 00 00 00"))
+    writer.close()
+
+
+def test_a_connection_that_is_closed_as_it_opens_is_noticed(capfd):
+    """aiomqtt forgets such a one, and would wait for ever."""
+
+    async def play():
+        async with await asyncio.start_server(closing, "127.0.0.1", 0) as server:
+            here = Broker(port=server.sockets[0].getsockname()[1])
+            sink = MqttSink("mqtt[1]", here, said_of(LABELS), "out", capacity=60)
+            await sink.start()
+            sink.row(row(1))
+            await until(lambda: sink.counters.disconnects >= 2, seconds=5)
+            await cancelled(sink._task)
+
+    asyncio.run(play())
+    assert capfd.readouterr().err.count("connection closed; trying again") == 1
+
+
+def test_a_broker_that_dies_before_it_has_said_that_it_had_an_event(capfd):
+    """It is noticed at once, not when the time for an answer is over; the event is sent again."""
+    got = []
+
+    async def deaf(reader, writer):
+        await reader.readuntil(b"MQTT")
+        writer.write(bytes.fromhex("20 03 00 00 00"))
+        await reader.readuntil(b"out/event/alarm")
+        got.append(None)
+        writer.close()
+
+    async def play():
+        async with await asyncio.start_server(deaf, "127.0.0.1", 0) as server:
+            here = Broker(port=server.sockets[0].getsockname()[1])
+            sink = MqttSink("mqtt[1]", here, said_of(LABELS), "out", capacity=60)
+            await sink.start()
+            sink.event(alarm(1))
+            await until(lambda: len(got) >= 2, seconds=5)
+            await cancelled(sink._task)
+
+    asyncio.run(play())
+
+
+def test_what_comes_while_we_are_away_is_kept(broker):
     """With a name and qos 1, as docs/live.md says."""
-    broker = mosquitto(tmp_path)
+    broker.start()
     us = Broker(port=broker.port, client_id="holdfast-1", qos=1)
 
     async def play():
         taken = []
-        for round_ in range(3):
+        for first in (0, 20, 40):
             source = source_of(us)
             task = asyncio.create_task(source.run(lambda s: taken.append(s.values["y:gps"])))
             await until(lambda s=source: s.connected)
-            await until(lambda n=20 * round_: len(taken) == n)
-            async with Broker(port=broker.port).connection(lambda *_: None) as sender:
-                for number in range(10):
-                    await sender.publish("in", f"{20 * round_ + number}".encode(), 1)
-                await until(lambda n=20 * round_ + 10: len(taken) == n)
-                await cancelled(task)
-                for number in range(10, 20):
-                    await sender.publish("in", f"{20 * round_ + number}".encode(), 1)
+            await until(lambda n=first: len(taken) == n)
+            await sent(broker, range(first, first + 10))
+            await until(lambda n=first + 10: len(taken) == n)
+            await cancelled(task)
+            await sent(broker, range(first + 10, first + 20))
         return taken
 
-    try:
-        assert asyncio.run(play()) == list(range(50))
-    finally:
-        broker.stop()
+    assert asyncio.run(play()) == list(range(50))
 
 
 @pytest.fixture
-def certified(tmp_path):
-    """A broker with a certificate for 127.0.0.1, and the authority that signed it."""
-    key, request = tmp_path / "broker.key", tmp_path / "broker.csr"
-    authority, signed = tmp_path / "authority.pem", tmp_path / "broker.pem"
-
-    program = program_of("openssl")
-
-    def openssl(*words):
-        subprocess.run([program, *map(str, words)], check=True, capture_output=True)
-
-    def made(place, name):
-        openssl("req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1",
-                "-nodes", "-days", 2, "-subj", f"/CN={name}", "-keyout", f"{place}.key",
-                "-out", place)  # fmt: skip
-
-    made(authority, "a test's authority")
-    made(tmp_path / "other.pem", "another authority")
-    openssl("req", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes",
-            "-subj", "/CN=broker", "-keyout", key, "-out", request)  # fmt: skip
-    (tmp_path / "names").write_text("subjectAltName=IP:127.0.0.1")
-    openssl("x509", "-req", "-in", request, "-CA", authority, "-CAkey", f"{authority}.key",
-            "-CAcreateserial", "-days", 2, "-extfile", tmp_path / "names",
-            "-out", signed)  # fmt: skip
-    found = mosquitto(tmp_path, "allow_anonymous true", f"certfile {signed}", f"keyfile {key}")
-    yield found, authority, tmp_path / "other.pem"
-    found.stop()
+def encrypted(tmp_path, broker):
+    """A broker with a certificate for 127.0.0.1, who signed it, and somebody else."""
+    found = certified(tmp_path)
+    broker.configure("allow_anonymous true", *found.lines)
+    broker.start()
+    return broker, found.authority, found.other
 
 
-def test_an_encrypted_broker(certified):
-    broker, authority, _ = certified
+def test_an_encrypted_broker(encrypted):
+    broker, authority, _ = encrypted
     us = Broker(port=broker.port, tls=ssl.create_default_context(cafile=str(authority)))
     sink = MqttSink("mqtt[1]", us, said_of(LABELS), "out", capacity=60)
     source = source_of(us, "out/estimate")
@@ -212,17 +278,22 @@ def test_an_encrypted_broker(certified):
 
 # paho leaves the socket of a failed handshake to the garbage collector
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_broker_that_nobody_vouches_for(certified, capfd):
-    broker, _, other = certified
+@pytest.mark.parametrize(("host", "right", "why"), [
+    ("127.0.0.1", False, "unable to get local issuer certificate"),
+    ("localhost", True, "Hostname mismatch"),
+])  # fmt: skip
+def test_a_broker_that_nobody_vouches_for(encrypted, capfd, host, right, why):
+    """By the wrong authority, or under another name."""
+    broker, authority, other = encrypted
+    tls = ssl.create_default_context(cafile=str(authority if right else other))
 
     async def play():
-        source = source_of(
-            Broker(port=broker.port, tls=ssl.create_default_context(cafile=str(other)))
-        )
+        source = source_of(Broker(host, broker.port, tls=tls))
         task = asyncio.create_task(source.run(lambda _: None))
         await until(lambda: source.counters.disconnects >= 2)
         await cancelled(task)
         return source
 
     assert not asyncio.run(play()).connected
-    assert "CERTIFICATE_VERIFY_FAILED" in capfd.readouterr().err
+    told = capfd.readouterr().err
+    assert told.count("CERTIFICATE_VERIFY_FAILED") == told.count(why) == 1

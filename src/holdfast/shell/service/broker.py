@@ -85,10 +85,17 @@ class Connection:
     async def __aenter__(self) -> "Connection":
         from aiomqtt import MqttError
 
+        ended = self._client._disconnected
         try:
             await self._client.__aenter__()
         except (MqttError, OSError) as error:
+            self._paho._sock_close()  # of a broker that does not answer nobody else closes it
             raise Broken(_words(error)) from None
+        if ended.done():
+            # it broke as soon as it was there: aiomqtt has forgotten, and would wait for ever
+            self._paho._sock_close()
+            why = ended.exception()
+            raise self._failure or Broken("connection closed" if why is None else _words(why))
         # aiomqtt asks for the socket later, when it may have been closed, and its number be that
         # of the next connection: an event loop that has lost its way
         self._paho.on_socket_register_write = self._wants_to_write
@@ -144,9 +151,8 @@ class Connection:
     async def gone(self) -> None:
         """Wait until the connection breaks, which it always does by raising."""
         try:
-            # a fault may have come with the connection itself, and of that aiomqtt tells nobody
-            while self._failure is None:
-                await anext(self._client.messages)
+            async for _ in self._client.messages:
+                pass
         finally:
             if self._failure is not None:
                 raise self._failure
@@ -168,8 +174,6 @@ class Connection:
         asyncio.get_running_loop().add_writer(sock.fileno(), self.write)
 
     def _received(self, client: Any, data: Any, message: Any) -> None:
-        if self._failure is not None:
-            raise self._failure  # paho offers the same message again until it is closed
         try:
             topic = message.topic
         except UnicodeDecodeError:
@@ -177,8 +181,10 @@ class Connection:
         try:
             self._handle(topic, message.payload)
         except Exception as error:
-            # paho takes it for a broken connection, and the broker keeps the message
+            # paho takes it for a broken connection, so that the broker keeps the message; reading
+            # on would bring the same one for ever
             self._failure = error
+            asyncio.get_running_loop().remove_reader(client.socket().fileno())
             raise
 
 
@@ -208,6 +214,10 @@ class Attempts:
 
 
 def _words(error: BaseException) -> str:
+    if getattr(getattr(error, "rc", None), "value", None) == REFUSED:
+        return "connection closed"  # paho's "Unspecified error": it was told no reason
+    if str(error) == "Operation timed out":
+        return "no answer, which is what one that wants TLS gives without it"
     return str(error) or type(error).__name__
 
 

@@ -178,27 +178,19 @@ class MqttSink(Sink):
 
     async def _send_by(self, connection: Connection) -> None:
         """Publish whatever comes until the connection breaks."""
-        watch = asyncio.create_task(self._until_gone(connection))
         try:
-            await self._emptied(connection)  # the oldest news
-            self._connection = connection
-            self._write_rows()
-            while not watch.done():
-                await self._waiting.wait()
-                await self._emptied(connection)
-            await watch
+            await connection.unless_gone(self._publish(connection))
         finally:
             self._connection = None
             self._take_back()
-            watch.cancel()
-            await asyncio.gather(watch, return_exceptions=True)
 
-    async def _until_gone(self, connection: Connection) -> None:
-        """Wait until the connection breaks, and wake the one who sends."""
-        try:
-            await connection.gone()
-        finally:
-            self._waiting.set()
+    async def _publish(self, connection: Connection) -> None:
+        await self._emptied(connection)  # the oldest news
+        self._connection = connection
+        self._write_rows()
+        while True:
+            await self._waiting.wait()
+            await self._emptied(connection)
 
     def _write_rows(self) -> None:
         """Give rows to the network without waiting for it: a task for every message would cost

@@ -163,6 +163,8 @@ def broker_of(table: Table, keys: Any, config: LiveConfig) -> Any:
     check_package(table.file, table.key)
     password = None
     if keys.password_env or keys.password_file:
+        if keys.username is None:
+            raise table.error("username", "none beside a password", "whose password it is")
         password = secret(config.path, f"{table.key}.password", keys.password_env,
                           keys.password_file, config.folder)  # fmt: skip
     tls = None
