@@ -84,7 +84,7 @@ def _attributes(found: xr.Dataset) -> Markup:
     """What the campaign was run with, and the command that runs it again."""
     given = {k: found.attrs[k] for k in ATTRIBUTES if k in found.attrs}
     # no time where nothing was run: NaN
-    rows = [[ATTRIBUTES[k], _value(value)] for k, value in given.items() if value == value]
+    rows = [[ATTRIBUTES[k], _setting(value)] for k, value in given.items() if value == value]
     parts = [table([Column("Setting"), Column("Value")], rows)] if rows else []
     if found.attrs.get("command"):
         above = element("p", "The command that runs it again:", class_="caption")
@@ -92,7 +92,7 @@ def _attributes(found: xr.Dataset) -> Markup:
     return join(parts)
 
 
-def _value(value: Any) -> str:
+def _setting(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
