@@ -39,6 +39,15 @@ async def cancelled(*tasks):
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
+async def turned_away(broker, times):
+    """A source that has tried so often, and is stopped."""
+    source = source_of(broker)
+    task = asyncio.create_task(source.run(lambda _: None))
+    await until(lambda: source.counters.disconnects >= times)
+    await cancelled(task)
+    return source
+
+
 async def round_trip(source, sink):
     """A row of the sink's comes to the source; whatever happens both are over then."""
     listening = asyncio.create_task(source.run(lambda _: None))
@@ -64,15 +73,7 @@ def test_a_user_with_a_password(guarded):
 def test_a_user_that_the_broker_does_not_know(guarded, password, capfd):
     """It is told once, without the secret, and tried again."""
     them = Broker(port=guarded.port, username="us", password=password)
-
-    async def play():
-        source = source_of(them)
-        task = asyncio.create_task(source.run(lambda _: None))
-        await until(lambda: source.counters.disconnects >= 3)
-        await cancelled(task)
-        return source
-
-    assert not asyncio.run(play()).connected
+    assert not asyncio.run(turned_away(them, 3)).connected
     told = capfd.readouterr().err
     assert told.count("Not authorized; trying again") == 1
     assert f"mqtt[1]: broker 127.0.0.1:{guarded.port}" in told
@@ -98,11 +99,7 @@ def test_a_topic_that_is_refused_is_no_connection(capfd):
 
     async def play():
         async with await asyncio.start_server(refusing, "127.0.0.1", 0) as server:
-            source = source_of(Broker(port=server.sockets[0].getsockname()[1]))
-            task = asyncio.create_task(source.run(lambda _: None))
-            await until(lambda: source.counters.disconnects >= 2)
-            await cancelled(task)
-        return source
+            return await turned_away(Broker(port=server.sockets[0].getsockname()[1]), 2)
 
     assert not asyncio.run(play()).connected
     told = capfd.readouterr().err
@@ -287,13 +284,6 @@ def test_a_broker_that_nobody_vouches_for(encrypted, capfd, host, right, why):
     broker, authority, other = encrypted
     tls = ssl.create_default_context(cafile=str(authority if right else other))
 
-    async def play():
-        source = source_of(Broker(host, broker.port, tls=tls))
-        task = asyncio.create_task(source.run(lambda _: None))
-        await until(lambda: source.counters.disconnects >= 2)
-        await cancelled(task)
-        return source
-
-    assert not asyncio.run(play()).connected
+    assert not asyncio.run(turned_away(Broker(host, broker.port, tls=tls), 2)).connected
     told = capfd.readouterr().err
     assert told.count("CERTIFICATE_VERIFY_FAILED") == told.count(why) == 1
